@@ -1,0 +1,274 @@
+"""The one configuration tree: sections, defaults, ranges and units.
+
+Every service gets the same tree and hands each part only its section. How values from presets,
+environment and command line are merged into it, and how a wrong one is reported, is the business
+of `shared.settings`. Cited constants come from the thesis (A.., Eq ..) and the readings of its
+errata (E..), see docs/algorithm.md.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,40}$")]
+"""A run, robot or world name: it becomes part of a Zenoh key, so no '/', '*', '$' or spaces."""
+
+Probability = Annotated[float, Field(ge=0.0, le=1.0)]
+Positive = Annotated[float, Field(gt=0.0)]
+
+
+class Section(BaseModel):
+    """Base of all sections: frozen, strict, unknown keys refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class RunConfig(Section):
+    """Which run this is."""
+
+    name: Name = "demo"
+    """First chunk of every Zenoh key, so that two runs never mix."""
+    seed: int = Field(default=1, ge=0, lt=2**63)
+    """The only seed: every random draw is a function of it, a role and a position (design 3)."""
+    episodes: int = Field(default=0, ge=0)
+    """Stop the run after this many counted episodes; 0 runs until stopped."""
+
+
+class BusConfig(Section):
+    """How services reach the Zenoh router."""
+
+    endpoint: str = Field(default="tcp/127.0.0.1:7447", min_length=5)
+    """Where clients connect, and where our own router listens (loopback unless told otherwise)."""
+    lease_ms: int = Field(default=2000, ge=200, le=60000)
+    """A frozen or cut-off service counts as gone after this time."""
+    request_timeout_s: float = Field(default=5.0, gt=0.0, le=120.0)
+    """One attempt of a request; it is repeated until answered."""
+    heartbeat_s: float = Field(default=1.0, gt=0.0, le=10.0)
+    """Period of status messages; three missed ones count as silence."""
+
+
+class CameraConfig(Section):
+    """The simulated camera (A1, A22, E31): level, ahead of the centre of the robot."""
+
+    height_m: float = Field(default=0.30, gt=0.0, lt=2.0)
+    forward_m: float = Field(default=0.11, ge=0.0, lt=0.5)
+    vertical_fov_deg: float = Field(default=45.0, gt=5.0, lt=120.0)
+    aspect: float = Field(default=16.0 / 9.0, gt=0.5, lt=4.0)
+    """Of the projection; the 16:9 picture is squeezed into 75x50 (E29)."""
+    render_width_px: int = Field(default=75, ge=75, le=1920)
+    render_height_px: int = Field(default=50, ge=50, le=1080)
+
+
+class RobotConfig(Section):
+    """The robot, its motion, and the limits its driver enforces whatever the network says."""
+
+    id: Name = "robotino1"
+    kind: Literal["sim"] = "sim"
+    timing: Literal["lockstep", "realtime"] = "lockstep"
+    """lockstep: simulated time stands still until the action has come; realtime: fixed period."""
+    world: Name = "plus"
+    period_s: float = Field(default=0.25, gt=0.01, le=2.0)
+    """Time one action lasts."""
+    speed_m_s: float = Field(default=0.6, gt=0.0, le=2.0)
+    """Forward speed of all three actions (A21, E31)."""
+    turn_rad_s: float = Field(default=math.radians(60.0), gt=0.0, le=3.0)
+    """Turn rate of forward/left and forward/right (A21, E31)."""
+    max_speed_m_s: float = Field(default=0.8, gt=0.0, le=2.0)
+    """Clamp: commands are cut to it."""
+    max_turn_rad_s: float = Field(default=1.5, gt=0.0, le=3.0)
+    """Clamp: commands are cut to it."""
+    deadman_s: float = Field(default=0.6, gt=0.0, le=10.0)
+    """Without a fresh action for this long the robot stops (simulated time in lockstep)."""
+    resend_s: float = Field(default=0.5, gt=0.0, le=10.0)
+    """Lockstep: an unanswered observation is sent again after this wall-clock time."""
+    recovery: Literal["back-off", "none"] = "back-off"
+    """What the driver does after a bump (E11); `none` is the literal variant."""
+    recovery_distance_m: float = Field(default=0.3, gt=0.0, le=1.0)
+    recovery_speed_m_s: float = Field(default=0.2, gt=0.0, le=0.5)
+    radius_m: float = Field(default=0.225, gt=0.0, le=1.0)
+    """Round shell with the ring bumper."""
+    camera: CameraConfig = CameraConfig()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.speed_m_s > self.max_speed_m_s:
+            raise ValueError(
+                f"robot.speed_m_s ({self.speed_m_s}) must not exceed robot.max_speed_m_s "
+                f"({self.max_speed_m_s})"
+            )
+        if self.turn_rad_s > self.max_turn_rad_s:
+            raise ValueError(
+                f"robot.turn_rad_s ({self.turn_rad_s}) must not exceed robot.max_turn_rad_s "
+                f"({self.max_turn_rad_s})"
+            )
+        if self.deadman_s < self.period_s:
+            raise ValueError(
+                f"robot.deadman_s ({self.deadman_s}) must be at least one robot.period_s "
+                f"({self.period_s})"
+            )
+        return self
+
+
+class EpisodeConfig(Section):
+    """Episode bookkeeping (A9, A10)."""
+
+    max_samples: int = Field(default=500, ge=2, le=5000)
+    """An episode ends at a bump or at this many unprocessed samples."""
+    horizon: int = Field(default=50, ge=1, le=500)
+    """Look-ahead of the reward; as many samples are carried over when no bump came."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.horizon >= self.max_samples:
+            raise ValueError(
+                f"episode.horizon ({self.horizon}) must be below episode.max_samples "
+                f"({self.max_samples})"
+            )
+        return self
+
+
+class RewardConfig(Section):
+    """Weights of Eq 3.1 and Eq 3.3."""
+
+    observed_weight: Probability = 0.8
+    prediction_weight: Probability = 0.2
+    bump_decay: float = Field(default=0.9, gt=0.0, lt=1.0)
+
+
+class PolicyConfig(Section):
+    """How actions are chosen (A18-A20)."""
+
+    kind: Literal["eps-greedy", "roulette", "eps-greedy-roulette"] = "eps-greedy-roulette"
+    epsilon: Probability = 0.1
+    """E3: 0.1 (10 %)."""
+    temperature: float = Field(default=0.01, gt=0.0, le=100.0)
+
+
+class NetworkConfig(Section):
+    """Shape of the Q network (A23, E16)."""
+
+    filters: int = Field(default=64, ge=4, le=256)
+    """Per convolution; 64 in the thesis. RMM needs a divisor or a multiple of 16 (A29)."""
+    layout: Literal["ccpccp", "cpcccp"] = "ccpccp"
+    """Order of the four convolutions and two pools: both end in 9x15 maps (E16)."""
+
+
+class MemoryConfig(Section):
+    """Replay memory: capacity, what is discarded, what is refreshed (A27-A35)."""
+
+    capacity: int = Field(default=45000, ge=30, le=5_000_000)
+    """N."""
+    fill: Literal["random", "policy", "none"] = "random"
+    """How the memory is filled before the first episode (A13, E9)."""
+    strategy: Literal["rmm", "normm"] = "rmm"
+    rule: Literal["paper", "cover"] = "paper"
+    """Marking against any newer sample, or only against kept ones (E23)."""
+    threshold_percent: int = Field(default=1, ge=1, le=7)
+    """Similarity threshold at the start; 1 % of 120 bits (A32, E18)."""
+    threshold_max_percent: int = Field(default=7, ge=1, le=100)
+    recompute_below: int = Field(default=0, ge=0)
+    """Fewer candidates of an over-quota action call for new marks; 0: 1000 scaled (A31, E17b)."""
+    raise_at_most: int = Field(default=0, ge=0)
+    """No more candidates than this raise the threshold; 0: 2000 scaled (A32, E17b)."""
+    equalise_every: int = Field(default=50, ge=0)
+    """Episodes between reward equalisations; 0 never (A35)."""
+    equalise_keep: Probability = 0.7
+    """Eq 3.5: r <- keep r + (1 - keep) Q."""
+    protect_terminal: bool = False
+    """E24: leave the -1 of terminal samples alone."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.threshold_percent > self.threshold_max_percent:
+            raise ValueError(
+                f"memory.threshold_percent ({self.threshold_percent}) must not exceed "
+                f"memory.threshold_max_percent ({self.threshold_max_percent})"
+            )
+        return self
+
+
+class LearningConfig(Section):
+    """The training step, the fitting phase and the target rule (A25, A26, A36)."""
+
+    mode: Literal["synchronous", "asynchronous"] = "synchronous"
+    """Whether the robot waits while the network trains."""
+    batch_size: int = Field(default=128, ge=1, le=4096)
+    mini_batches_per_episode: int = Field(default=1, ge=0, le=1000)
+    learning_rate: float = Field(default=0.00025, gt=0.0, le=1.0)
+    rmsprop_alpha: float = Field(default=0.9, ge=0.0, lt=1.0)
+    """E30."""
+    rmsprop_epsilon: float = Field(default=1e-6, gt=0.0, le=1.0)
+    """E30."""
+    fit_every: int = Field(default=100, ge=0)
+    """Episodes between fitting phases; 0 never."""
+    fit_epochs: int = Field(default=3, ge=1, le=1000)
+    target_rule: Literal["bump", "episode"] = "episode"
+    """Copy train to target at the end of episodes with a bump (paper, A26) or of every one (E15)."""
+
+
+class Numerics(Section):
+    """Arithmetic of one role. It is part of the configuration: equal settings, equal bits."""
+
+    device: Literal["cpu", "cuda"] = "cpu"
+    threads: int = Field(default=1, ge=1, le=256)
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """bfloat16: convolutions and matrix products under autocast; sums and weights stay float32."""
+    batch: int = Field(default=32, ge=1, le=4096)
+    """Images per pass; inference pads to it so that results do not depend on company."""
+
+
+class NumericsConfig(Section):
+    """Numerics by role; the single-process loop applies the same ones per role."""
+
+    actor: Numerics = Numerics(batch=1)
+    replay: Numerics = Numerics(batch=32)
+    learner: Numerics = Numerics(batch=16)
+
+
+class Config(Section):
+    """The whole tree."""
+
+    run: RunConfig = RunConfig()
+    bus: BusConfig = BusConfig()
+    robot: RobotConfig = RobotConfig()
+    episode: EpisodeConfig = EpisodeConfig()
+    reward: RewardConfig = RewardConfig()
+    policy: PolicyConfig = PolicyConfig()
+    network: NetworkConfig = NetworkConfig()
+    memory: MemoryConfig = MemoryConfig()
+    learning: LearningConfig = LearningConfig()
+    numerics: NumericsConfig = NumericsConfig()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        filters = self.network.filters
+        if self.memory.strategy == "rmm" and filters % 16 and 16 % filters:
+            raise ValueError(
+                f"memory.strategy 'rmm' needs network.filters to divide 16 or to be a multiple "
+                f"of 16, got {filters}"
+            )
+        return self
+
+    @property
+    def max_distance_m(self) -> float:
+        """Farthest reachable point within the horizon: v * dt * horizon (Eq 3.2, E31)."""
+        return self.robot.speed_m_s * self.robot.period_s * self.episode.horizon
+
+    def to_dict(self) -> dict[str, Any]:
+        """The tree as plain nested dictionaries."""
+        return self.model_dump(mode="json")
+
+    def fingerprint(self) -> str:
+        """16 hex digits over everything that must agree between services that work together.
+
+        Where the router is, how long the run goes on, and which robot a driver drives may differ.
+        """
+        tree = self.to_dict()
+        del tree["bus"], tree["run"]["episodes"], tree["robot"]["id"]
+        text = json.dumps(tree, sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()[:16]

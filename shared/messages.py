@@ -1,0 +1,460 @@
+"""Every message of the protocol, typed, one class per fact or request.
+
+The same objects are the in-process types. On the wire each is a msgpack map of its fields plus
+``"v"`` (protocol version) and ``"t"`` (class name), see `shared.codec`; who sends what to whom
+stands in `shared.keys`. Arrays travel as raw little-endian bytes whose size is checked here.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+PROTOCOL_VERSION = 1
+IMAGE_SHAPE = (50, 75)
+IMAGE_BYTES = IMAGE_SHAPE[0] * IMAGE_SHAPE[1]
+MAX_EPISODE_SAMPLES = 5000
+"""More samples than this in one episode are refused, whatever the configuration says."""
+
+ImageArray = npt.NDArray[np.uint8]
+Life = Annotated[str, Field(pattern=r"^[0-9a-f]{12}$")]
+"""12 hex digits, drawn at process start; a clean stop saves it and the next start carries on."""
+Ident = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,40}$")]
+Count = Annotated[int, Field(ge=0, lt=2**63)]
+Image = Annotated[bytes, Field(min_length=IMAGE_BYTES, max_length=IMAGE_BYTES)]
+"""uint8 [50, 75] grey, row by row from the top left."""
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
+
+Interruption = Literal["", "pause", "estop", "late", "stop", "restart", "world"]
+"""Why the robot did not simply execute the last action; empty: it did."""
+
+
+class Message(BaseModel):
+    """Base of all messages: frozen, strictly typed, unknown fields refused, no NaN."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+def image_array(image: bytes) -> ImageArray:
+    """The bytes of an image as a read-only uint8 [50, 75] view."""
+    return np.frombuffer(image, np.uint8).reshape(IMAGE_SHAPE)
+
+
+# ---------------------------------------------------------------- robot <-> actor
+
+
+class Observation(Message):
+    """What the robot perceives after action `sequence - 1`, and where it waits for the next.
+
+    Driver to actor and monitor. In lockstep it is sent again until answered.
+    """
+
+    robot: Ident
+    life: Life
+    sequence: Count
+    """Grows by one per executed action; the action that answers it carries the same number."""
+    image: Image
+    x_m: float
+    y_m: float
+    heading_rad: float
+    bump: bool
+    """Contact at any time during the last action (E11); a recovery, if any, is already done."""
+    interruption: Interruption = ""
+    world: Ident
+    period_s: Annotated[float, Field(gt=0.0)]
+    stamp_s: float
+    """Simulated time in lockstep, the driver's monotonic clock in realtime."""
+    laps: int = 0
+    """Net laps driven since the life began, where the world has a lap line (sign: direction)."""
+
+
+class Action(Message):
+    """The answer to one observation. Actor to driver."""
+
+    robot: Ident
+    actor_life: Life
+    robot_life: Life
+    sequence: Count
+    """Of the observation answered; the driver ignores any other than the one it waits on."""
+    action: Annotated[int, Field(ge=0, le=2)] | None
+    """0 forward, 1 forward/left, 2 forward/right (A21); None: hold still for one period."""
+    greedy: bool
+    values: tuple[float, float, float]
+    """Clipped predictions Q(s, a) of the three actions, for the monitor."""
+    weights_version: Count
+
+
+class RobotCommand(Message):
+    """Operator's wish to the driver, acknowledged by `RobotState`. Anyone to driver."""
+
+    command: Literal["estop", "clear", "pause", "resume"]
+
+
+class RobotState(Message):
+    """Heartbeat of a driver and its answer to commands. Driver to anyone."""
+
+    robot: Ident
+    life: Life
+    state: Literal["waiting", "driving", "recovering", "paused", "estop", "stopped"]
+    sequence: Count
+    x_m: float
+    y_m: float
+    heading_rad: float
+    world: Ident
+    bumps: Count
+    recoveries: Count
+    deadman_stops: Count
+    clamped: Count
+    late_actions: Count
+    refused_actions: Count
+    resent_observations: Count
+    undecodable: Count
+    laps: int
+    laps_left: Count
+    """Completed laps anticlockwise (turning left round the island)."""
+    laps_right: Count
+    """Completed laps clockwise."""
+
+
+# ---------------------------------------------------------------- actor -> replay
+
+
+class Episode(Message):
+    """The samples one episode releases, asking to be stored. Actor to replay, answered by
+    `EpisodeAck`. Identity is (robot, life, number): the same one is stored once, however often sent.
+    """
+
+    robot: Ident
+    life: Life
+    """Of the actor process that gathered it."""
+    number: Count
+    """Counts this actor life's submissions for this robot from 0."""
+    fill: bool
+    """Gathered to fill the memory: not counted as an episode (E9)."""
+    ended: Literal["bump", "full", "interrupted"]
+    bump: bool
+    weights_version: Count
+    """Target network that predicted the rewards, and the least one replay must use for this turn."""
+    fitness: Count
+    """Actions without a bump including carried-over ones, at most 500 (A37, E10)."""
+    actions: Count
+    """Actions executed since the previous episode of this robot ended."""
+    dropped_samples: Count
+    """Samples lost to interruptions and restarts since the previous submission."""
+    dropped_episodes: Count
+    """Open episodes lost with an actor or driver since the previous submission."""
+    worlds: Annotated[tuple[Ident, ...], Field(min_length=1, max_length=64)]
+    """Names that `sample_worlds` points into."""
+    images: bytes
+    """uint8 [n, 50, 75]."""
+    sample_actions: bytes
+    """uint8 [n], 0..2."""
+    sample_rewards: bytes
+    """float32 [n], -1..1."""
+    sample_steps: bytes
+    """uint32 [n]: step of the robot's episode in which each was gathered."""
+    sample_episodes: bytes
+    """uint32 [n]: the robot's own episode count when each was gathered (carried ones: one less)."""
+    sample_versions: bytes
+    """uint32 [n]: weights version that chose each action."""
+    sample_worlds: bytes
+    """uint8 [n]: index into `worlds`."""
+    positions: bytes
+    """float32 [n, 3]: x_m, y_m, heading_rad at each sample."""
+    robot_life: Life
+    last_sequence: Count
+    """Driver sequence of the newest sample released: what came after it is not stored yet."""
+    laps_left: Count = 0
+    laps_right: Count = 0
+    """Laps completed while the samples were gathered."""
+
+    @model_validator(mode="after")
+    def _sizes(self) -> Self:
+        n = self.count
+        if not 0 <= n <= MAX_EPISODE_SAMPLES:
+            raise ValueError(f"an episode has 0..{MAX_EPISODE_SAMPLES} samples, got {n}")
+        for name, width in (
+            ("images", IMAGE_BYTES),
+            ("sample_rewards", 4),
+            ("sample_steps", 4),
+            ("sample_episodes", 4),
+            ("sample_versions", 4),
+            ("sample_worlds", 1),
+            ("positions", 12),
+        ):
+            size = len(getattr(self, name))
+            if size != n * width:
+                raise ValueError(f"{name}: expected {n} x {width} bytes, got {size}")
+        if n and max(self.sample_actions) > 2:
+            raise ValueError(f"sample_actions: expected 0..2, got {max(self.sample_actions)}")
+        if n and max(self.sample_worlds) >= len(self.worlds):
+            raise ValueError("sample_worlds: index outside worlds")
+        rewards = np.frombuffer(self.sample_rewards, "<f4")
+        if not bool(np.all(np.abs(rewards) <= 1.0)):  # also false for NaN
+            raise ValueError("sample_rewards: expected -1..1")
+        return self
+
+    @property
+    def count(self) -> int:
+        """Number of samples n."""
+        return len(self.sample_actions)
+
+
+class EpisodeAck(Message):
+    """The episode is on disk, exactly once. Replay to actor. It says nothing about training."""
+
+    accepted: bool
+    reason: str = ""
+    """Why it was refused for good; empty if accepted."""
+    duplicate: bool = False
+    commit: Count = 0
+    """Number of the submission among all, fill ones included."""
+    episode: Count = 0
+    """The global episode number e; for fill submissions that of the latest counted one."""
+    progress: RobotProgress | None = None
+
+
+class ProgressRequest(Message):
+    """Where was this robot? Actor to replay, answered by `RobotProgress`."""
+
+    robot: Ident
+
+
+class RobotProgress(Message):
+    """What replay has on disk, as far as one robot's next episode depends on it."""
+
+    robot: Ident
+    filling: bool
+    """The memory is still being filled (A13)."""
+    fill_missing: Count
+    robot_fills: Count
+    """Fill submissions of this robot so far."""
+    robot_episodes: Count
+    """Counted episodes of this robot so far."""
+    episode: Count
+    """Newest global episode number committed."""
+    robot_life: str
+    """Driver life of the robot's newest stored sample; empty if none."""
+    last_sequence: int
+    """Driver sequence of that sample; -1 if none."""
+
+
+# ---------------------------------------------------------------- replay -> learner
+
+
+class ReplayState(Message):
+    """Heartbeat of replay: newest numbers only, everything else is pulled. Replay to all."""
+
+    id: Ident
+    life: Life
+    change: Count
+    """Newest change number n."""
+    commit: Count
+    episode: Count
+    """Newest counted episode committed to disk."""
+    turn: Count
+    """Newest episode whose discard and equalisation are done: the learner may train on it."""
+    turn_change: Count
+    """Change number the learner must reach before training on `turn`."""
+    size: Count
+    capacity: Count
+    filling: bool
+    by_action: tuple[Count, Count, Count]
+    candidates_by_action: tuple[Count, Count, Count]
+    threshold_bits: Count
+    weights_version: Count
+    activity: Literal["idle", "committing", "descriptors", "equalising", "discarding", "waiting"]
+    progress: Fraction = 1.0
+    fitness_mean_100: float
+    bumps: Count
+    laps_left: Count
+    laps_right: Count
+    actions: Count
+    dropped_samples: Count
+    dropped_episodes: Count
+    duplicates: Count
+    refused: Count
+    undecodable: Count
+
+
+class TurnsRequest(Message):
+    """Which episodes are ready for training after episode `since`? Learner to replay."""
+
+    since: Count
+    limit: Annotated[int, Field(ge=1, le=1000)] = 100
+
+
+class Turn(Message):
+    """One counted episode ready for training."""
+
+    episode: Count
+    change: Count
+    bump: bool
+    actions: Count
+    samples: Count
+
+
+class Turns(Message):
+    """Answer to `TurnsRequest`, in order of episode, without gaps."""
+
+    turns: tuple[Turn, ...]
+
+
+class ChangesRequest(Message):
+    """Bring me from change `since` to change `upto`. Learner to replay; many replies."""
+
+    since: Count
+    upto: Count
+
+
+class SnapshotRequest(Message):
+    """The whole memory as of the newest turn. Learner to replay; many replies."""
+
+
+class Change(Message):
+    """One numbered change of the memory, or a part of one, in the order it was applied."""
+
+    number: Count
+    """Change number; parts of one change share it and come in order."""
+    last: bool
+    """Final part of this change."""
+    kind: Literal["append", "discard", "rewards"]
+    ids: bytes
+    """uint64 [n] insertion numbers, ascending: appended, removed, or given new rewards."""
+    images: bytes = b""
+    """append: uint8 [n, 50, 75]."""
+    actions: bytes = b""
+    """append: uint8 [n]."""
+    rewards: bytes = b""
+    """append, rewards: float32 [n]."""
+
+    @model_validator(mode="after")
+    def _sizes(self) -> Self:
+        if len(self.ids) % 8:
+            raise ValueError(f"ids: expected a multiple of 8 bytes, got {len(self.ids)}")
+        n = len(self.ids) // 8
+        widths = {
+            "append": (IMAGE_BYTES, 1, 4),
+            "discard": (0, 0, 0),
+            "rewards": (0, 0, 4),
+        }[self.kind]
+        for name, width in zip(("images", "actions", "rewards"), widths, strict=True):
+            size = len(getattr(self, name))
+            if size != n * width:
+                raise ValueError(f"{self.kind}.{name}: expected {n} x {width} bytes, got {size}")
+        return self
+
+
+class FeedEnd(Message):
+    """Last reply to `ChangesRequest` and `SnapshotRequest`; without it the transfer broke."""
+
+    change: Count
+    """The mirror now stands at exactly this change."""
+    rows: Count
+    """Rows sent before, over all parts: to be compared with what arrived."""
+    messages: Count
+    """Parts sent before."""
+    gone: bool = False
+    """The changes asked for are no longer kept: take a snapshot."""
+
+
+class MiniBatchRequest(Message):
+    """A mini-batch for learners that keep no mirror (third parties); one `Change` comes back."""
+
+    size: Annotated[int, Field(ge=1, le=4096)]
+    key: Count
+    """Same key and same memory: same mini-batch."""
+
+
+# ---------------------------------------------------------------- learner -> actor, replay
+
+
+class LearnerState(Message):
+    """Heartbeat of the learner, and its announcement of finished turns. Learner to all."""
+
+    id: Ident
+    life: Life
+    episode: Count
+    """Newest turn done: trained, target rule applied, checkpoint on disk."""
+    weights_version: Count
+    """Newest target version; fetch it by `WeightsRequest`."""
+    weights_hash: Hash
+    activity: Literal["waiting", "synchronising", "training", "fitting", "checkpoint"]
+    fit_epoch: Count = 0
+    fit_batch: Count = 0
+    fit_batches: Count = 0
+    """Mini-batches of the running fitting phase, all epochs."""
+    loss: float | None
+    """Mean loss of the newest turn trained."""
+    train_steps: Count
+    fits: Count
+    target_age: Count
+    """Turns since the target was last copied."""
+    resyncs: Count
+    undecodable: Count
+
+
+class WeightsRequest(Message):
+    """The newest target network, please. Actor, replay, anyone to learner."""
+
+
+class Weights(Message):
+    """One version of the target network. Learner's answer; at most 8 MB a part."""
+
+    version: Count
+    hash: Hash
+    """First 16 hex digits of SHA-256 over all bytes."""
+    part: Count
+    parts: Annotated[int, Field(ge=1, le=64)]
+    data: bytes
+    """safetensors; concatenate the parts in order."""
+
+
+# ---------------------------------------------------------------- every service
+
+
+class ActorState(Message):
+    """Heartbeat of the actor, one per robot served. Actor to all."""
+
+    id: Ident
+    life: Life
+    robot: Ident
+    phase: Literal["waiting", "filling", "driving", "handing-over", "training", "stopped"]
+    step: Count
+    """Samples in the open episode."""
+    robot_episode: Count
+    weights_version: Count
+    actions: Count
+    actions_per_s: float
+    stale_observations: Count
+    dropped_samples: Count
+    dropped_episodes: Count
+    resent_episodes: Count
+    undecodable: Count
+    values: tuple[float, float, float]
+
+
+class ServiceCommand(Message):
+    """Ask a service to stop cleanly. Anyone to any service, answered by `ServiceReply`."""
+
+    command: Literal["stop", "ping"]
+
+
+class ServiceReply(Message):
+    """A service's answer to `ServiceCommand`: who it is."""
+
+    service: Ident
+    id: Ident
+    life: Life
+    pid: Count
+    protocol: Count
+    version: str
+    config: Hash
+    uptime_s: float
+
+
+EpisodeAck.model_rebuild()
