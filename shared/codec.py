@@ -1,0 +1,54 @@
+"""Messages to msgpack bytes and back. No pickle, nothing executed, sizes and types checked first."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import msgpack
+from pydantic import ValidationError
+
+from shared.errors import BadMessage
+from shared.messages import PROTOCOL_VERSION, Message
+
+M = TypeVar("M", bound=Message)
+
+
+def encode(message: Message) -> bytes:
+    """The message as a msgpack map of its fields, plus "v" (protocol) and "t" (type name)."""
+    fields: dict[str, Any] = {"v": PROTOCOL_VERSION, "t": type(message).__name__}
+    fields.update(message.model_dump())
+    data: bytes = msgpack.packb(fields, use_bin_type=True)
+    return data
+
+
+def decode(data: bytes, *types: type[M]) -> M:
+    """The message in `data`, which must be one of `types`.
+
+    Raises BadMessage for anything that is not msgpack, not a map, of another protocol version, of
+    another type, or with missing, unknown or badly typed fields.
+    """
+    expected = " or ".join(t.__name__ for t in types)
+    try:
+        fields = msgpack.unpackb(data, raw=False, use_list=False, strict_map_key=True)
+    except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
+        raise BadMessage(f"expected {expected}, got {len(data)} bytes that are not msgpack: {error}") from error
+    if not isinstance(fields, dict):
+        raise BadMessage(f"expected {expected} as a map, got {type(fields).__name__}")
+    version = fields.pop("v", None)
+    if version != PROTOCOL_VERSION or isinstance(version, bool):
+        raise BadMessage(f"expected {expected} of protocol {PROTOCOL_VERSION}, got {version!r}")
+    name = fields.pop("t", None)
+    for cls in types:
+        if cls.__name__ == name:
+            try:
+                return cls.model_validate(fields)
+            except ValidationError as error:
+                raise BadMessage(f"{name}: {first_problem(error)}") from error
+    raise BadMessage(f"expected {expected}, got type {name!r}")
+
+
+def first_problem(error: ValidationError) -> str:
+    """The first complaint of a validation, in one line without the (possibly huge) input."""
+    problem = error.errors(include_url=False, include_input=False, include_context=False)[0]
+    where = ".".join(str(part) for part in problem["loc"])
+    return f"{where}: {problem['msg']}" if where else str(problem["msg"])

@@ -1,0 +1,48 @@
+"""All errors of our own.
+
+CorridorError
+├── ConfigError        wrong configuration or folder: exit code 2, one line, nothing moved yet
+├── StateError         what lies on disk does not fit or is damaged: exit code 3
+├── BadMessage         bytes that are not a valid message of the expected type
+└── BusError
+    ├── RouterMissing  no router at the endpoint (yet)
+    ├── PeerMissing    nobody serves this request now
+    ├── PeerSilent     served, but no complete answer in time
+    └── PeerRefused    answered with an error; the text is the peer's
+"""
+
+
+class CorridorError(Exception):
+    """Base of all errors this project raises on purpose."""
+
+
+class ConfigError(CorridorError):
+    """A configuration that cannot work, told in one line: key, expected, got, where from."""
+
+
+class StateError(CorridorError):
+    """State on disk that does not belong to this run or is damaged."""
+
+
+class BadMessage(CorridorError):
+    """Bytes that are not a valid message: says what was expected and what came."""
+
+
+class BusError(CorridorError):
+    """Something between the services."""
+
+
+class RouterMissing(BusError):
+    """No router answers at the endpoint."""
+
+
+class PeerMissing(BusError):
+    """No service answers this request: it is not there, or the router is not."""
+
+
+class PeerSilent(BusError):
+    """The answer did not come, or broke off, before the deadline."""
+
+
+class PeerRefused(BusError):
+    """The peer answered with an error."""

@@ -1,0 +1,203 @@
+"""What all services share: connecting, being visible, stopping cleanly, logging, exit codes."""
+
+from __future__ import annotations
+
+import logging
+import os
+import secrets
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import TypeVar
+
+from shared.bus import Bus, Inbox
+from shared.config import Config
+from shared.errors import BusError, ConfigError, CorridorError, RouterMissing, StateError
+from shared.keys import SERVICE
+from shared.messages import PROTOCOL_VERSION, ServiceCommand, ServiceReply
+
+VERSION = "0.1.0"
+EXIT_OK, EXIT_CRASH, EXIT_CONFIG, EXIT_STATE = 0, 1, 2, 3
+TICK_S = 0.2
+"""Longest a service waits before it looks at its stop flag."""
+T = TypeVar("T")
+log = logging.getLogger(__name__)
+
+
+class Stopped(Exception):
+    """The service was asked to stop while it waited: unwinds to its main function."""
+
+
+def new_life() -> str:
+    """A fresh random life id: 12 hex digits."""
+    return secrets.token_hex(6)
+
+
+class Service:
+    """One running service: its bus, its stop flag, and its answers to `ping` and `stop`."""
+
+    def __init__(self, name: str, ident: str, life: str, config: Config, bus: Bus, stop: StopFlag) -> None:
+        self.name, self.ident, self.life = name, ident, life
+        self.config, self.bus, self.stop = config, bus, stop
+        self.started_s = time.monotonic()
+        self.log = logging.getLogger(name)
+
+    def meet(self) -> None:
+        """Become visible, after checking that everybody here speaks the same protocol and config.
+
+        Raises ConfigError naming the first peer that differs.
+        """
+        fingerprint = self.config.fingerprint()
+        for peer in self.bus.peers():
+            if peer.protocol != str(PROTOCOL_VERSION):
+                raise ConfigError(
+                    f"{self.name}: speaks protocol {PROTOCOL_VERSION}, but {peer.service} "
+                    f"{peer.id!r} of run {self.config.run.name!r} speaks {peer.protocol}"
+                )
+            if peer.config != fingerprint:
+                raise ConfigError(
+                    f"{self.name}: has configuration {fingerprint}, but {peer.service} {peer.id!r} "
+                    f"of run {self.config.run.name!r} has {peer.config}: start both from one file"
+                )
+        self.bus.announce(self.name, self.ident, self.life, PROTOCOL_VERSION, fingerprint)
+
+    def serve_control(self, inbox: Inbox) -> None:
+        """Answer `ping` and `stop` until stopped (runs in a thread of its own)."""
+        while not self.stop.is_set():
+            inbox.wait(TICK_S)
+            for request in inbox.requests():
+                with request:
+                    if isinstance(request.message, ServiceCommand):
+                        request.reply(self.describe())
+                        if request.message.command == "stop":
+                            self.stop.set("asked to stop")
+
+    def describe(self) -> ServiceReply:
+        """Who this service is."""
+        return ServiceReply(
+            service=self.name,
+            id=self.ident,
+            life=self.life,
+            pid=os.getpid(),
+            protocol=PROTOCOL_VERSION,
+            version=VERSION,
+            config=self.config.fingerprint(),
+            uptime_s=time.monotonic() - self.started_s,
+        )
+
+    def insist(self, what: str, attempt: Callable[[], T]) -> T:
+        """Repeat a request until it is answered; log when it takes long. Raises Stopped."""
+        start_s, next_report_s = time.monotonic(), 5.0
+        while True:
+            if self.stop.is_set():
+                raise Stopped(what)
+            try:
+                return attempt()
+            except BusError as error:
+                waited_s = time.monotonic() - start_s
+                if waited_s > next_report_s:
+                    self.log.warning("still waiting to %s after %.0f s: %s", what, waited_s, error)
+                    next_report_s *= 2
+                self.stop.wait(0.05 if waited_s < 2 else TICK_S)
+
+
+class StopFlag:
+    """Set by SIGTERM, SIGINT, a `stop` command or the end of the run; remembers why."""
+
+    def __init__(self) -> None:
+        self._event = threading.Event()
+        self.reason = ""
+        self._wakes: list[Callable[[], None]] = []
+
+    def set(self, reason: str) -> None:
+        """Ask the service to stop."""
+        if not self._event.is_set():
+            self.reason = reason
+            self._event.set()
+            for wake in self._wakes:
+                wake()
+
+    def is_set(self) -> bool:
+        """Whether the service is to stop."""
+        return self._event.is_set()
+
+    def wait(self, timeout_s: float) -> bool:
+        """Sleep for at most `timeout_s`; True as soon as the service is to stop."""
+        return self._event.wait(timeout_s)
+
+    def on_set(self, wake: Callable[[], None]) -> None:
+        """Call `wake` when set (to interrupt a wait)."""
+        self._wakes.append(wake)
+
+
+@contextmanager
+def service(name: str, ident: str, config: Config, *, life: str | None = None) -> Iterator[Service]:
+    """Connect, meet the others and become visible; stop threads and close the bus at the end."""
+    stop = StopFlag()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        stop.set(signal.Signals(number).name)
+
+    signal.signal(signal.SIGTERM, on_signal)
+    signal.signal(signal.SIGINT, on_signal)
+    with _connect(name, config, stop) as bus:
+        me = Service(name, ident, life or new_life(), config, bus, stop)
+        me.meet()
+        control = bus.inbox()
+        control.serve(SERVICE, f"{name}-{ident}")
+        thread = threading.Thread(target=me.serve_control, args=(control,), daemon=True)
+        thread.start()
+        me.log.info("%s %r of run %r is up (life %s)", name, ident, config.run.name, me.life)
+        try:
+            yield me
+        finally:
+            stop.set("finished")
+            thread.join(2.0)
+            me.log.info("%s %r stops: %s", name, ident, stop.reason)
+
+
+def _connect(name: str, config: Config, stop: StopFlag) -> Bus:
+    """A bus, as soon as a router answers. Raises Stopped when told to stop first."""
+    told = False
+    while not stop.is_set():
+        try:
+            return Bus(config.bus, config.run.name)
+        except RouterMissing as error:
+            if not told:
+                log.warning("%s waits for the router: %s", name, error)
+                told = True
+            stop.wait(TICK_S)
+    raise Stopped("waiting for the router")
+
+
+def setup_logging(name: str, folder: Path | None) -> None:
+    """Log to standard error and, with a folder, to `<folder>/logs/<name>.log`."""
+    handlers: list[logging.Handler] = [logging.StreamHandler(sys.stderr)]
+    if folder is not None:
+        (folder / "logs").mkdir(parents=True, exist_ok=True)
+        handlers.append(logging.FileHandler(folder / "logs" / f"{name}.log"))
+    form = f"%(asctime)s {name} %(levelname)s %(message)s"
+    logging.basicConfig(level=logging.INFO, format=form, handlers=handlers, force=True)
+
+
+def guarded(name: str, main: Callable[[], None]) -> int:
+    """Run a service's main function and turn how it ends into an exit code and one line."""
+    try:
+        main()
+    except Stopped:
+        return EXIT_OK
+    except (ConfigError, StateError) as error:
+        log.error("%s", error)
+        return EXIT_CONFIG if isinstance(error, ConfigError) else EXIT_STATE
+    except CorridorError:
+        log.exception("%s failed", name)
+        return EXIT_CRASH
+    except Exception:  # the only place: say what happened, then let the supervisor restart us
+        log.exception("%s crashed", name)
+        return EXIT_CRASH
+    return EXIT_OK
