@@ -1,0 +1,291 @@
+"""From presets, files, environment and command line to one checked `Config`, and back to TOML.
+
+Later sources win: defaults < preset < file < environment < command line. Whatever cannot work is
+refused here, before anything starts, with one `ConfigError` line that names the key, what was
+expected, what came and where it came from. The folder of a run belongs to one configuration.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import os
+import re
+import tempfile
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+from pydantic.fields import FieldInfo
+
+from shared.config import Config, Section
+from shared.errors import ConfigError, StateError
+
+ENV_PREFIX = "CORRIDOR_"
+FILE_NAME = "config.toml"
+Tree = dict[str, Any]
+
+
+def load(
+    preset: str | None = None,
+    file: Path | None = None,
+    overrides: Sequence[str] = (),
+    env: Mapping[str, str] | None = None,
+) -> Config:
+    """The configuration all sources together give.
+
+    Args:
+        preset: name of one in `experiments/presets`, or the path of a TOML file.
+        file: path of a TOML file; wins over the preset.
+        overrides: `section.key=value` texts from the command line, later ones win.
+        env: the environment; `CORRIDOR_<SECTION>__<KEY>` is read from it.
+
+    Raises:
+        ConfigError: on the first problem of any source.
+    """
+    merged = _Merged()
+    if preset is not None:
+        merged.add_tree(*_read_preset(preset))
+    if file is not None:
+        merged.add_tree(_read_toml(file, "configuration file"), f"configuration file {file}")
+    for name, text in sorted((env or {}).items()):
+        # Compose files pass unset variables on as empty ones.
+        if name.startswith(ENV_PREFIX) and text:
+            key = name.removeprefix(ENV_PREFIX).lower().replace("__", ".")
+            merged.add_text(key, text, f"environment variable {name}")
+    for item in overrides:
+        key, equals, text = item.partition("=")
+        if not equals:
+            raise ConfigError(f"--set: expected section.key=value, got {item!r}")
+        merged.add_text(key.strip(), text.strip(), "command line")
+    return merged.validate()
+
+
+def preset_names() -> list[str]:
+    """Names of the presets that come with the package."""
+    folder = resources.files("experiments").joinpath("presets")
+    names = (entry.name for entry in folder.iterdir())
+    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
+
+
+def keys(section: type[Section] = Config, prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    """All settings as dotted keys with their field, in the order of the tree."""
+    for name, field in section.model_fields.items():
+        if _is_section(field):
+            yield from keys(field.annotation, f"{prefix}{name}.")  # type: ignore[arg-type]
+        else:
+            yield prefix + name, field
+
+
+def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested tables as one table of dotted keys."""
+    flat: dict[str, Any] = {}
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            flat.update(flatten(value, f"{prefix}{name}."))
+        else:
+            flat[prefix + name] = value
+    return flat
+
+
+def differences(old: Config, new: Config) -> list[tuple[str, Any, Any]]:
+    """All keys in which two configurations differ: key, old value, new value."""
+    after = flatten(new.to_dict())
+    return [(k, v, after[k]) for k, v in flatten(old.to_dict()).items() if v != after[k]]
+
+
+def toml_value(value: bool | int | float | str) -> str:
+    """One value as TOML."""
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return repr(value).lower()
+
+
+def to_toml(config: Config) -> str:
+    """The whole tree as TOML; reading it back gives an equal tree."""
+    lines: list[str] = []
+
+    def add(tree: Tree, path: str) -> None:
+        if path:
+            lines.extend(["", f"[{path}]"])
+        tables = {name: value for name, value in tree.items() if isinstance(value, dict)}
+        lines.extend(f"{k} = {toml_value(v)}" for k, v in tree.items() if k not in tables)
+        for name, table in tables.items():
+            add(table, f"{path}.{name}" if path else name)
+
+    add(config.to_dict(), "")
+    return "\n".join(lines).lstrip("\n") + "\n"
+
+
+def write(config: Config, path: Path) -> None:
+    """Write the resolved tree as TOML, whole or not at all."""
+    temporary = _write_beside(config, path)
+    os.replace(temporary, path)
+
+
+def claim(folder: Path, config: Config) -> Config:
+    """Take the run folder for this configuration; returns the one stored in it.
+
+    The first use creates the folder and its `config.toml`, which then never changes. Only what
+    `Config.fingerprint` leaves out (where the router is, how long the run goes on, the robot's
+    id) may differ on later uses.
+
+    Raises:
+        ConfigError: the folder belongs to another configuration, or cannot be made.
+        StateError: its `config.toml` cannot be read.
+    """
+    path = folder / FILE_NAME
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not path.exists():
+            _create(config, path)
+    except OSError as error:
+        raise ConfigError(f"run folder {folder}: cannot be created: {error.strerror}") from error
+    stored = read_folder(folder)
+    if stored.fingerprint() != config.fingerprint():
+        name, old, new = _first_binding_difference(stored, config)
+        raise ConfigError(
+            f"run folder {folder} belongs to another configuration: {name} is {toml_value(old)} "
+            f"there, but {toml_value(new)} now; use another run name (--run) or folder (--run-dir)"
+        )
+    return stored
+
+
+def read_folder(folder: Path) -> Config:
+    """The configuration stored in a run folder. Raises StateError if there is none or it is bad."""
+    path = folder / FILE_NAME
+    try:
+        return load(file=path)
+    except ConfigError as error:
+        raise StateError(f"run folder {folder} is damaged: {error}") from error
+
+
+def _create(config: Config, path: Path) -> None:
+    """Write the file unless another process was faster."""
+    temporary = _write_beside(config, path)
+    try:
+        os.link(temporary, path)
+    except FileExistsError:
+        pass
+    finally:
+        temporary.unlink()
+
+
+def _write_beside(config: Config, path: Path) -> Path:
+    """The tree in a temporary file in the same folder, on disk."""
+    header = "# Resolved configuration of this run, written when the run began.\n\n"
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    with os.fdopen(handle, "w", encoding="utf-8") as stream:
+        stream.write(header + to_toml(config))
+        stream.flush()
+        os.fchmod(stream.fileno(), 0o644)
+        os.fsync(stream.fileno())
+    return Path(name)
+
+
+def _first_binding_difference(stored: Config, config: Config) -> tuple[str, Any, Any]:
+    """The first difference that changes the fingerprint."""
+    different = differences(stored, config)
+    binding = (d for d in different if _binds(d[0]))
+    return next(binding, different[0])
+
+
+def _binds(key: str) -> bool:
+    """Whether a setting is part of the fingerprint."""
+    return not (key.startswith("bus.") or key in {"run.episodes", "robot.id"})
+
+
+class _Merged:
+    """Values of all sources so far, and where each came from."""
+
+    def __init__(self) -> None:
+        self.values: Tree = {}
+        self.sources: dict[str, str] = {}
+        self.fields = dict(keys())
+
+    def add_tree(self, tree: Tree, source: str) -> None:
+        """Merge the tables of a TOML file."""
+        for key, value in flatten(tree).items():
+            self._set(key, value, source)
+
+    def add_text(self, key: str, text: str, source: str) -> None:
+        """Merge one value given as text: TOML if it is valid TOML, else the text itself."""
+        try:
+            value = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            value = text
+        field = self.fields.get(key)
+        if field is not None and field.annotation is str and not isinstance(value, str):
+            value = text  # a run may be called 2024
+        self._set(key, value, source)
+
+    def _set(self, key: str, value: Any, source: str) -> None:
+        if key not in self.fields:
+            raise ConfigError(f"{self._unknown(key)} ({source})")
+        *path, name = key.split(".")
+        table = self.values
+        for chunk in path:
+            table = table.setdefault(chunk, {})
+        table[name] = value
+        self.sources[key] = source
+
+    def _unknown(self, key: str) -> str:
+        inside = [name for name in self.fields if name.startswith(key + ".")]
+        if inside:
+            return f"{key}: expected a key inside this section, such as {inside[0]}"
+        same_end = [name for name in self.fields if name.rsplit(".", 1)[-1] == key]
+        near = same_end or difflib.get_close_matches(key, self.fields, n=1)
+        hint = f", did you mean {near[0]}?" if near else ", see `corridor config`"
+        return f"{key}: unknown key{hint}"
+
+    def validate(self) -> Config:
+        """The checked tree. Raises ConfigError for the first problem."""
+        try:
+            return Config.model_validate(self.values)
+        except ValidationError as error:
+            problem = error.errors(include_url=False)[0]
+        key = ".".join(str(chunk) for chunk in problem["loc"])
+        if problem["type"] == "value_error":  # a combination: its text names the keys
+            text = problem["msg"].removeprefix("Value error, ")
+            raise ConfigError(f"{text} ({self._sources_of(text)})")
+        expected = problem["msg"].removeprefix("Input should be ")
+        expected = re.sub(r"^String should ", "a text to ", expected)
+        source = self.sources.get(key, "default")
+        raise ConfigError(f"{key}: expected {expected}, got {problem['input']!r:.100} ({source})")
+
+    def _sources_of(self, text: str) -> str:
+        """Where the keys named in a text came from, without repetition."""
+        named = [key for key in self.fields if re.search(rf"(?<![\w.]){re.escape(key)}\b", text)]
+        return "; ".join(f"{key}: {self.sources.get(key, 'default')}" for key in named)
+
+
+def _is_section(field: FieldInfo) -> bool:
+    return isinstance(field.annotation, type) and issubclass(field.annotation, Section)
+
+
+def _read_preset(preset: str) -> tuple[Tree, str]:
+    """The tables of a preset and how to name it as a source."""
+    if preset.endswith(".toml") or "/" in preset:
+        return _read_toml(Path(preset), "preset file"), f"preset file {preset}"
+    if preset not in preset_names():
+        known = ", ".join(preset_names())
+        raise ConfigError(f"--preset: expected one of {known} or a .toml file, got {preset!r}")
+    text = resources.files("experiments").joinpath("presets", f"{preset}.toml").read_bytes()
+    return _parse(text, f"preset {preset}"), f"preset {preset}"
+
+
+def _read_toml(path: Path, what: str) -> Tree:
+    try:
+        return _parse(path.read_bytes(), f"{what} {path}")
+    except OSError as error:
+        raise ConfigError(f"{what} {path}: cannot be read: {error.strerror}") from error
+
+
+def _parse(data: bytes, source: str) -> Tree:
+    try:
+        return tomllib.loads(data.decode("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{source}: expected TOML: {error}") from error
