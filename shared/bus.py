@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import threading
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
@@ -19,7 +21,14 @@ from zenoh.handlers import FifoChannel
 
 from shared.codec import decode, encode
 from shared.config import BusConfig
-from shared.errors import BadMessage, PeerMissing, PeerRefused, PeerSilent, RouterMissing
+from shared.errors import (
+    BadMessage,
+    ConfigError,
+    PeerMissing,
+    PeerRefused,
+    PeerSilent,
+    RouterMissing,
+)
 from shared.keys import IDENT, Peer, Stream, alive_key, parse_alive
 from shared.messages import Message
 
@@ -322,3 +331,26 @@ class Bus:
         replies = self._session.liveliness().get(f"{self.run}/alive/**", timeout=timeout_s)
         peers = (parse_alive(str(reply.ok.key_expr)) for reply in replies if reply.ok)
         return sorted((peer for peer in peers if peer), key=lambda peer: (peer.service, peer.id))
+
+
+@contextmanager
+def open_router(endpoint: str) -> Iterator[str]:
+    """Be a Zenoh router while the block runs; yields the locator it listens on.
+
+    Args:
+        endpoint: where to listen, such as `tcp/127.0.0.1:7447`; port 0 takes a free one.
+
+    Raises:
+        ConfigError: it cannot listen there, for instance because the port is in use.
+    """
+    try:
+        session = zenoh.open(zenoh_config("router", listen=[endpoint]))
+    except zenoh.ZError as error:
+        reason = re.sub(r" at \S+\.rs:\d+\.?", "", str(error))
+        raise ConfigError(f"router: cannot listen on {endpoint!r}: {reason}") from error
+    try:
+        replies = session.get(f"@/{session.zid()}/router", timeout=5.0)
+        answers = [json.loads(reply.ok.payload.to_string()) for reply in replies if reply.ok]
+        yield answers[0]["locators"][0] if answers and answers[0]["locators"] else endpoint
+    finally:
+        session.close()  # type: ignore[no-untyped-call]

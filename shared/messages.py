@@ -68,8 +68,10 @@ class Observation(Message):
     period_s: Annotated[float, Field(gt=0.0)]
     stamp_s: float
     """Simulated time in lockstep, the driver's monotonic clock in realtime."""
-    laps: int = 0
-    """Net laps driven since the life began, where the world has a lap line (sign: direction)."""
+    laps_left: Count = 0
+    """Laps completed anticlockwise (turning left) since the life began, where the world has laps."""
+    laps_right: Count = 0
+    """Laps completed clockwise."""
 
 
 class Action(Message):
@@ -113,11 +115,8 @@ class RobotState(Message):
     refused_actions: Count
     resent_observations: Count
     undecodable: Count
-    laps: int
     laps_left: Count
-    """Completed laps anticlockwise (turning left round the island)."""
     laps_right: Count
-    """Completed laps clockwise."""
 
 
 # ---------------------------------------------------------------- actor -> replay
@@ -175,8 +174,8 @@ class Episode(Message):
     @model_validator(mode="after")
     def _sizes(self) -> Self:
         n = self.count
-        if not 0 <= n <= MAX_EPISODE_SAMPLES:
-            raise ValueError(f"an episode has 0..{MAX_EPISODE_SAMPLES} samples, got {n}")
+        if not 1 <= n <= MAX_EPISODE_SAMPLES:
+            raise ValueError(f"an episode has 1..{MAX_EPISODE_SAMPLES} samples, got {n}")
         for name, width in (
             ("images", IMAGE_BYTES),
             ("sample_rewards", 4),
@@ -189,9 +188,9 @@ class Episode(Message):
             size = len(getattr(self, name))
             if size != n * width:
                 raise ValueError(f"{name}: expected {n} x {width} bytes, got {size}")
-        if n and max(self.sample_actions) > 2:
+        if max(self.sample_actions) > 2:
             raise ValueError(f"sample_actions: expected 0..2, got {max(self.sample_actions)}")
-        if n and max(self.sample_worlds) >= len(self.worlds):
+        if max(self.sample_worlds) >= len(self.worlds):
             raise ValueError("sample_worlds: index outside worlds")
         rewards = np.frombuffer(self.sample_rewards, "<f4")
         if not bool(np.all(np.abs(rewards) <= 1.0)):  # also false for NaN
@@ -215,6 +214,8 @@ class EpisodeAck(Message):
     """Number of the submission among all, fill ones included."""
     episode: Count = 0
     """The global episode number e; for fill submissions that of the latest counted one."""
+    stored: Count = 0
+    """Samples stored: all, but for the last fill submission, which is cut at the capacity (A13)."""
     progress: RobotProgress | None = None
 
 

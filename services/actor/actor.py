@@ -1,0 +1,235 @@
+"""The actor of one robot: chooses actions, keeps the open episode, computes rewards.
+
+No bus and no clock in here: the service and the single-process loop feed it observations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from shared.config import Config
+from shared.messages import Action, Episode, Observation, RobotProgress, image_array
+from shared.rl.draws import generator
+from shared.rl.episode import Ending, OpenEpisode, Release, Step, stale_steps, with_current_max_q
+from shared.rl.policy import choose, choose_uniformly
+from shared.rl.predictor import Predictor
+from shared.rl.reward import episode_rewards
+
+
+class Actor:
+    """Turns observations of one robot into actions and finished episodes.
+
+    For every observation call `finish` first and, once what it returned is committed, `act`. Between
+    the two the target network may change (only there: all actions of an episode come from one).
+    """
+
+    def __init__(self, config: Config, robot: str, life: str, predictor: Predictor) -> None:
+        self._config, self._robot, self._predictor = config, robot, predictor
+        self.life = life
+        self.open = OpenEpisode(config.episode)
+        self.progress: RobotProgress | None = None
+        self.submissions = 0
+        self.actions = 0
+        self.dropped_samples = 0
+        self.dropped_episodes = 0
+        self._unreported_samples = 0
+        self._unreported_episodes = 0
+        self._actions_before = 0
+        self._laps_before = (0, 0)
+        self._expected: tuple[str, int] | None = None
+        """Driver life and sequence of the observation that continues the open episode."""
+
+    @property
+    def filling(self) -> bool:
+        """Whether actions gather samples for filling the memory (A13, E9)."""
+        return self.progress is not None and self.progress.filling
+
+    def begin(self, progress: RobotProgress, observation: Observation) -> None:
+        """Start with what replay has of this robot; count what an earlier actor process lost.
+
+        Every executed action after the newest stored sample was gathered by a process that is gone:
+        the driver's numbering tells how many there were.
+        """
+        self.progress = progress
+        self._laps_before = (observation.laps_left, observation.laps_right)
+        if self._expected == (observation.life, observation.sequence):
+            return  # continues after a clean stop: nothing is lost
+        if progress.robot_life == observation.life:
+            lost = observation.sequence - (progress.last_sequence + 1)
+            self._drop(samples=lost, episodes=int(lost > 0))
+        elif progress.robot_life:
+            self._drop(samples=0, episodes=1)
+
+    def finish(self, observation: Observation) -> Episode | None:
+        """End the open episode if this observation ends it; return what is to be stored.
+
+        None when the episode goes on, or when it ended without releasing a sample.
+        """
+        ending = self._ending(observation)
+        if ending is None:
+            return None
+        release = self.open.end(ending)
+        if ending == "interrupted":
+            self._drop(samples=release.dropped, episodes=int(release.count == 0))
+        if release.count == 0:
+            return None
+        return self._submission(release, observation)
+
+    def committed(self, progress: RobotProgress) -> None:
+        """The last submission is on disk: continue from there."""
+        self.progress = progress
+        self.submissions += 1
+        self._unreported_samples = self._unreported_episodes = 0
+
+    def act(self, observation: Observation) -> Action:
+        """Choose an action with the current target network and append the step (A11, A26)."""
+        assert self.progress is not None, "begin() comes first"
+        image = image_array(observation.image)
+        values = self._predictor.all_values(image[np.newaxis])[0]
+        number = len(self.open)
+        if self.progress.filling:
+            episode = self.progress.robot_fills
+            draw = generator(self._config.run.seed, "fill", self._robot, episode, number)
+            uniform = self._config.memory.fill == "random"
+        else:
+            episode = self.progress.robot_episodes
+            draw = generator(self._config.run.seed, "policy", self._robot, episode, number)
+            uniform = False
+        if uniform:
+            action, greedy = choose_uniformly(draw), False
+        else:
+            action, greedy = choose(values, self._config.policy, draw)
+        version = self._predictor.version
+        self.open.add(
+            Step(
+                image=observation.image,
+                action=action,
+                x_m=observation.x_m,
+                y_m=observation.y_m,
+                heading_rad=observation.heading_rad,
+                world=observation.world,
+                max_q=float(values.max()),
+                max_q_version=version,
+                acted_version=version,
+                number=number,
+                robot_episode=episode,
+                sequence=observation.sequence,
+            )
+        )
+        self.actions += 1
+        self._expected = (observation.life, observation.sequence + 1)
+        return Action(
+            robot=self._robot,
+            actor_life=self.life,
+            robot_life=observation.life,
+            sequence=observation.sequence,
+            action=action,
+            greedy=greedy,
+            values=(float(values[0]), float(values[1]), float(values[2])),
+            weights_version=version,
+        )
+
+    def state(self) -> dict[str, Any]:
+        """Everything a later process needs to continue exactly here, for msgpack."""
+        return {
+            "life": self.life,
+            "submissions": self.submissions,
+            "actions": self.actions,
+            "dropped": [self.dropped_samples, self.dropped_episodes],
+            "unreported": [self._unreported_samples, self._unreported_episodes],
+            "actions_before": self._actions_before,
+            "laps_before": list(self._laps_before),
+            "expected": list(self._expected) if self._expected else None,
+            "steps": [asdict(step) for step in self.open.steps],
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from `state()`. Raises KeyError, TypeError or ValueError when it is damaged."""
+        self.life = str(state["life"])
+        self.submissions, self.actions = int(state["submissions"]), int(state["actions"])
+        self.dropped_samples, self.dropped_episodes = state["dropped"]
+        self._unreported_samples, self._unreported_episodes = state["unreported"]
+        self._actions_before = int(state["actions_before"])
+        left, right = state["laps_before"]
+        self._laps_before = (int(left), int(right))
+        expected = state["expected"]
+        self._expected = (str(expected[0]), int(expected[1])) if expected else None
+        self.open = OpenEpisode(self._config.episode, tuple(Step(**step) for step in state["steps"]))
+
+    def _ending(self, observation: Observation) -> Ending | None:
+        """How this observation ends the open episode, if it does (A9, E6, E10, E11)."""
+        if not len(self.open):
+            return None
+        continues = self._expected == (observation.life, observation.sequence)
+        if observation.interruption or not continues:
+            return "interrupted"
+        if observation.bump:
+            return "bump"
+        return "full" if self.open.full else None
+
+    def _drop(self, *, samples: int, episodes: int) -> None:
+        self.dropped_samples += max(samples, 0)
+        self.dropped_episodes += episodes
+        self._unreported_samples += max(samples, 0)
+        self._unreported_episodes += episodes
+
+    def _submission(self, release: Release, observation: Observation) -> Episode:
+        version = self._predictor.version
+        stale = stale_steps(release, version)
+        steps = release.steps
+        if len(stale):
+            images = np.stack([image_array(steps[i].image) for i in stale])
+            values = self._predictor.all_values(images)
+            steps = with_current_max_q(steps, values, stale, version)
+        bump = release.ending == "bump"
+        ahead = [step.max_q for step in steps[1 : release.count + 1]]
+        rewards = episode_rewards(
+            np.array([(step.x_m, step.y_m) for step in steps]),
+            np.array(ahead + [0.0] * (release.count - len(ahead))),
+            bump=bump,
+            horizon=self._config.episode.horizon,
+            max_distance_m=self._config.max_distance_m,
+            config=self._config.reward,
+        )
+        actions, self._actions_before = self.actions - self._actions_before, self.actions
+        laps = (observation.laps_left, observation.laps_right)
+        before, self._laps_before = self._laps_before, laps
+        released = steps[: release.count]
+        return Episode(
+            robot=self._robot,
+            life=self.life,
+            number=self.submissions,
+            fill=self.filling,
+            ended=release.ending,
+            bump=bump,
+            weights_version=version,
+            fitness=release.fitness,
+            actions=actions,
+            dropped_samples=self._unreported_samples,
+            dropped_episodes=self._unreported_episodes,
+            robot_life=self._expected[0] if self._expected else observation.life,
+            last_sequence=released[-1].sequence,
+            laps_left=max(laps[0] - before[0], 0),
+            laps_right=max(laps[1] - before[1], 0),
+            **_columns(released, rewards),
+        )
+
+
+def _columns(steps: tuple[Step, ...], rewards: np.ndarray[Any, np.dtype[np.float32]]) -> dict[str, Any]:
+    """The per-sample fields of an `Episode`, as bytes."""
+    worlds = tuple(dict.fromkeys(step.world for step in steps))
+    places = [(step.x_m, step.y_m, step.heading_rad) for step in steps]
+    return {
+        "worlds": worlds,
+        "images": b"".join(step.image for step in steps),
+        "sample_actions": bytes(step.action for step in steps),
+        "sample_rewards": rewards.astype("<f4").tobytes(),
+        "sample_steps": np.array([step.number for step in steps], "<u4").tobytes(),
+        "sample_episodes": np.array([step.robot_episode for step in steps], "<u4").tobytes(),
+        "sample_versions": np.array([step.acted_version for step in steps], "<u4").tobytes(),
+        "sample_worlds": bytes(worlds.index(step.world) for step in steps),
+        "positions": np.array(places, "<f4").tobytes(),
+    }

@@ -1,0 +1,202 @@
+"""The replay memory: samples in order of insertion, each image stored once as uint8.
+
+`SampleStore` holds what training needs and serves as the learner's mirror; `ReplayMemory` adds
+provenance, descriptors and candidate marks. Which samples go is decided in `retention`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from shared.rl.descriptor import BYTES
+from shared.rl.network import IMAGE_HEIGHT, IMAGE_WIDTH
+from shared.rl.policy import ACTIONS
+
+Ids = npt.NDArray[np.uint64]
+Mask = npt.NDArray[np.bool_]
+Images = npt.NDArray[np.uint8]
+
+MIRROR = np.dtype([("id", "<u8"), ("slot", "<u4"), ("action", "u1"), ("reward", "<f4")])
+"""id: insertion number; slot: where the image lies (never visible outside this file)."""
+
+SAMPLE = np.dtype(
+    [
+        *MIRROR.descr,
+        ("commit", "<u4"),  # submission that brought it: robot, life and worlds stand there
+        ("episode", "<u4"),  # global episode number e; 0 while the memory was filled
+        ("robot_episode", "<u4"),
+        ("step", "<u4"),
+        ("version", "<u4"),  # weights that chose the action
+        ("world", "<u2"),  # index into ReplayMemory.worlds
+        ("x_m", "<f4"),
+        ("y_m", "<f4"),
+        ("heading_rad", "<f4"),
+        ("descriptor", "u1", (BYTES,)),
+        ("described_by", "<u4"),  # weights version of the descriptor; 0: none yet
+        ("candidate", "?"),
+        ("forced", "?"),  # marked by decree (A44): a recomputation does not wipe it
+        ("marked_by", "<u4"),
+    ]
+)
+BLOCK = 4096
+"""Images per block: the store grows and shrinks by blocks and is never copied as a whole."""
+
+
+class SampleStore:
+    """Rows ordered by insertion number, with their images in blocks of fixed place."""
+
+    def __init__(self, dtype: np.dtype[np.void] = MIRROR) -> None:
+        self.rows: npt.NDArray[np.void] = np.zeros(0, dtype)
+        self._blocks: list[Images] = []
+        self._free: list[int] = []
+
+    def __len__(self) -> int:
+        """Number of samples."""
+        return len(self.rows)
+
+    @property
+    def ids(self) -> Ids:
+        """Insertion numbers, ascending: uint64 [n]."""
+        return self.rows["id"]
+
+    def append(self, rows: npt.NDArray[np.void], images: Images) -> None:
+        """Add samples with ascending insertion numbers beyond all stored ones.
+
+        rows: [k] with every field but `slot` set; images: uint8 [k, 50, 75], copied. Raises
+        ValueError when sizes, order, actions or rewards are wrong; nothing is stored then.
+        """
+        if images.shape != (len(rows), IMAGE_HEIGHT, IMAGE_WIDTH) or images.dtype != np.uint8:
+            raise ValueError(
+                f"images: expected uint8 [{len(rows)}, {IMAGE_HEIGHT}, {IMAGE_WIDTH}], "
+                f"got {images.dtype} {list(images.shape)}"
+            )
+        if not len(rows):
+            return
+        ids = rows["id"]
+        if (len(self) and ids[0] <= self.ids[-1]) or np.any(ids[1:] <= ids[:-1]):
+            raise ValueError("insertion numbers must grow")
+        if rows["action"].max() >= ACTIONS:
+            raise ValueError(f"action: expected 0..{ACTIONS - 1}, got {rows['action'].max()}")
+        if not np.all(np.abs(rows["reward"]) <= 1.0):
+            raise ValueError("reward: expected -1..1")
+        added = rows.astype(self.rows.dtype, copy=True)
+        added["slot"] = self._take_slots(len(rows))
+        self._write(added["slot"], images)
+        self.rows = np.concatenate([self.rows, added])
+
+    def remove(self, ids: Ids) -> None:
+        """Remove the samples with these insertion numbers. Raises KeyError if one is missing."""
+        ranks = self.ranks(ids)
+        self._free.extend(int(slot) for slot in self.rows["slot"][ranks][::-1])
+        keep = np.ones(len(self), np.bool_)
+        keep[ranks] = False
+        self.rows = self.rows[keep]
+
+    def ranks(self, ids: Ids) -> npt.NDArray[np.int64]:
+        """Positions of insertion numbers among the stored ones. Raises KeyError if one is missing."""
+        ranks = np.searchsorted(self.ids, ids)
+        if np.any(ranks >= len(self)) or np.any(self.ids[np.minimum(ranks, len(self) - 1)] != ids):
+            raise KeyError("insertion number not in memory")
+        return ranks
+
+    def set_rewards(self, ids: Ids, rewards: npt.NDArray[np.float32]) -> None:
+        """Replace the rewards of these samples. Raises KeyError if one is missing."""
+        self.rows["reward"][self.ranks(ids)] = rewards
+
+    def images(self, ranks: npt.NDArray[np.int64]) -> Images:
+        """Copies of the images at these ranks: uint8 [k, 50, 75]."""
+        slots = self.rows["slot"][ranks]
+        images = np.empty((len(slots), IMAGE_HEIGHT, IMAGE_WIDTH), np.uint8)
+        blocks, places = np.divmod(slots, BLOCK)
+        for block in np.unique(blocks):
+            here = blocks == block
+            images[here] = self._blocks[block][places[here]]
+        return images
+
+    def by_action(self) -> list[int]:
+        """Number of samples of each action."""
+        return [int(n) for n in np.bincount(self.rows["action"], minlength=ACTIONS)]
+
+    def check_valid(self) -> None:
+        """Raise AssertionError naming the first invariant that does not hold."""
+        slots = [int(slot) for slot in self.rows["slot"]]
+        places = sorted([*slots, *self._free])
+        rewards = self.rows["reward"]
+        for holds, invariant in (
+            (bool(np.all(self.ids[1:] > self.ids[:-1])), "insertion numbers grow"),
+            (places == list(range(len(self._blocks) * BLOCK)), "each slot is used or free, once"),
+            (not len(self) or int(self.rows["action"].max()) < ACTIONS, "actions are known"),
+            (bool(np.all(np.abs(rewards) <= 1.0)), "rewards lie in [-1, 1]"),
+        ):
+            if not holds:
+                raise AssertionError(f"replay memory: broken invariant: {invariant}")
+
+    def _take_slots(self, count: int) -> npt.NDArray[np.uint32]:
+        while len(self._free) < count:
+            start = len(self._blocks) * BLOCK
+            self._blocks.append(np.empty((BLOCK, IMAGE_HEIGHT, IMAGE_WIDTH), np.uint8))
+            self._free = list(range(start + BLOCK - 1, start - 1, -1)) + self._free
+        taken = self._free[-count:][::-1]
+        del self._free[-count:]
+        return np.array(taken, np.uint32)
+
+    def _write(self, slots: npt.NDArray[np.uint32], images: Images) -> None:
+        blocks, places = np.divmod(slots, BLOCK)
+        for block in np.unique(blocks):
+            here = blocks == block
+            self._blocks[block][places[here]] = images[here]
+
+
+class ReplayMemory(SampleStore):
+    """The store of replay: capacity, provenance, descriptors and marks (A27-A34)."""
+
+    def __init__(self, capacity: int) -> None:
+        super().__init__(SAMPLE)
+        self.worlds: list[str] = []
+        self.set_capacity(capacity)
+
+    def set_capacity(self, capacity: int) -> None:
+        """Change N while running; surplus samples go at the next discard. Raises ValueError."""
+        if capacity < 1:
+            raise ValueError(f"capacity: expected at least 1, got {capacity}")
+        self.capacity = capacity
+
+    def world_indices(self, names: Sequence[str]) -> npt.NDArray[np.uint16]:
+        """Indices of world names in `worlds`, which grows as needed."""
+        for name in names:
+            if name not in self.worlds:
+                self.worlds.append(name)
+        return np.array([self.worlds.index(name) for name in names], np.uint16)
+
+    def candidates_by_action(self) -> list[int]:
+        """Number of discard candidates of each action."""
+        marked = self.rows["action"][self.rows["candidate"]]
+        return [int(n) for n in np.bincount(marked, minlength=ACTIONS)]
+
+    def force_candidates(self, ids: Ids) -> None:
+        """Mark samples by decree (A44): the marks stay until the samples are discarded."""
+        ranks = self.ranks(ids)
+        self.rows["forced"][ranks] = True
+        self.rows["candidate"][ranks] = True
+
+    def check_valid(self) -> None:
+        """Raise AssertionError naming the first invariant that does not hold."""
+        super().check_valid()
+        rows = self.rows
+        for holds, invariant in (
+            (bool(np.all(rows["candidate"] | ~rows["forced"])), "forced samples are candidates"),
+            (
+                bool(np.all(~rows["candidate"] | rows["forced"] | (rows["marked_by"] > 0))),
+                "candidates know the version that marked them",
+            ),
+            (
+                bool(np.all((rows["marked_by"] == 0) | (rows["described_by"] > 0))),
+                "marked samples have a descriptor",
+            ),
+            (not len(rows) or int(rows["world"].max()) < len(self.worlds), "worlds are known"),
+        ):
+            if not holds:
+                raise AssertionError(f"replay memory: broken invariant: {invariant}")

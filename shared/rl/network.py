@@ -1,0 +1,144 @@
+"""The Q network (section 3.4, Fig 3.6): one grey image and one action in, one reward out."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from safetensors.torch import load as load_safetensors
+from safetensors.torch import save as save_safetensors
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812  (the customary name)
+
+from shared.rl.draws import generator
+
+if TYPE_CHECKING:
+    from shared.config import NetworkConfig
+
+IMAGE_HEIGHT, IMAGE_WIDTH = 50, 75
+MAP_HEIGHT, MAP_WIDTH = 9, 15
+"""MaxPool2 maps: valid padding, stride 1, floor pooling (E16)."""
+ACTION_VECTORS = ((1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (1.0, 0.0, 1.0))
+"""A21; the first bit is always 1 and kept for shape fidelity (E35)."""
+MAX_WEIGHT_BYTES = 64 * 1024 * 1024
+
+
+class QNetwork(nn.Module):
+    """Conv1-4, two pools, FConn1-3 and Out; 1,238,337 parameters at 64 filters (A23)."""
+
+    action_vectors: Tensor
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        filters = config.filters
+        self.layout = config.layout
+        self.conv1 = nn.Conv2d(1, filters, 3)
+        self.conv2 = nn.Conv2d(filters, filters, 3)
+        self.conv3 = nn.Conv2d(filters, filters, 3)
+        self.conv4 = nn.Conv2d(filters, filters, 3)
+        self.fconn1 = nn.Linear(filters * MAP_HEIGHT * MAP_WIDTH, 128)
+        self.fconn2 = nn.Linear(3, 32)
+        self.fconn3 = nn.Linear(128 + 32, 128)
+        self.out = nn.Linear(128, 1)
+        self.register_buffer("action_vectors", torch.tensor(ACTION_VECTORS), persistent=False)
+
+    def maps(self, images: Tensor) -> Tensor:
+        """MaxPool2 feature maps [n, filters, 9, 15] of images [n, 1, 50, 75] in [0, 1].
+
+        ReLU comes after pooling where the two meet: both orders are equal, this one is cheaper.
+        """
+        x = F.relu(self.conv1(images))
+        if self.layout == "ccpccp":
+            x = F.relu(F.max_pool2d(self.conv2(x), 2))
+            x = F.relu(self.conv3(x))
+        else:
+            x = F.max_pool2d(x, 2)
+            x = F.relu(self.conv2(x))
+            x = F.relu(self.conv3(x))
+        return F.relu(F.max_pool2d(self.conv4(x), 2))
+
+    def values(self, maps: Tensor, actions: Tensor) -> Tensor:
+        """Unclipped Q(s, a) [n] from maps [n, filters, 9, 15] and action numbers [n]."""
+        state = F.relu(self.fconn1(maps.flatten(1)))
+        action = F.relu(self.fconn2(self.action_vectors[actions]))
+        return self._out(state, action)
+
+    def all_values(self, maps: Tensor) -> Tensor:
+        """Unclipped Q(s, a) [n, 3] of all actions: one trunk, three heads."""
+        state = F.relu(self.fconn1(maps.flatten(1)))
+        encoded = F.relu(self.fconn2(self.action_vectors))
+        n, actions = len(state), len(encoded)
+        states = state.unsqueeze(1).expand(n, actions, -1).reshape(n * actions, -1)
+        return self._out(states, encoded.repeat(n, 1)).view(n, actions)
+
+    def _out(self, state: Tensor, action: Tensor) -> Tensor:
+        hidden = F.relu(self.fconn3(torch.cat([state, action], dim=1)))
+        return torch.as_tensor(self.out(hidden)).squeeze(1)
+
+
+def initialised(config: NetworkConfig, seed: int) -> QNetwork:
+    """A network with Glorot uniform weights and zero biases (A23), drawn from the run's seed."""
+    network = QNetwork(config)
+    with torch.no_grad():
+        for name, parameter in network.named_parameters():
+            if parameter.dim() == 1:
+                parameter.zero_()
+                continue
+            receptive = parameter[0, 0].numel()
+            fan_out, fan_in = parameter.shape[0] * receptive, parameter.shape[1] * receptive
+            bound = float(np.sqrt(6.0 / (fan_in + fan_out)))
+            drawn = generator(seed, "initial weights", name).uniform(-bound, bound, parameter.shape)
+            parameter.copy_(torch.from_numpy(drawn.astype(np.float32)))
+    return network.to(memory_format=torch.channels_last)
+
+
+def to_bytes(network: QNetwork) -> bytes:
+    """The parameters as safetensors bytes, float32, the same bytes for the same parameters."""
+    tensors = {name: p.detach().cpu().contiguous() for name, p in network.state_dict().items()}
+    return save_safetensors(dict(sorted(tensors.items())))
+
+
+def load_bytes(network: QNetwork, data: bytes) -> None:
+    """Take over parameters from safetensors bytes after checking names, shapes, types, values.
+
+    Raises ValueError and leaves the network as it was if anything does not fit.
+    """
+    if len(data) > MAX_WEIGHT_BYTES:
+        raise ValueError(f"weights: at most {MAX_WEIGHT_BYTES} bytes, got {len(data)}")
+    try:
+        tensors = load_safetensors(data)
+    except Exception as error:  # noqa: BLE001  (the library raises its own untyped errors)
+        raise ValueError(f"weights: not safetensors: {error}") from error
+    own = network.state_dict()
+    if tensors.keys() != own.keys():
+        odd = sorted(tensors.keys() ^ own.keys())
+        raise ValueError(f"weights: expected the tensors {sorted(own)}, differs in {odd}")
+    for name, tensor in tensors.items():
+        if tensor.shape != own[name].shape or tensor.dtype != torch.float32:
+            raise ValueError(
+                f"weights: {name}: expected float32 {list(own[name].shape)}, "
+                f"got {tensor.dtype} {list(tensor.shape)}"
+            )
+        if not bool(torch.isfinite(tensor).all()):
+            raise ValueError(f"weights: {name}: not finite")
+    with torch.no_grad():
+        for name, parameter in network.named_parameters():
+            parameter.copy_(tensors[name])
+
+
+def weights_hash(data: bytes) -> str:
+    """First 16 hex digits of SHA-256 over safetensors bytes."""
+    return hashlib.sha256(data).hexdigest()[:16]
+
+
+def parameter_count(network: QNetwork) -> int:
+    """Number of trained parameters: 1,238,337 at 64 filters."""
+    return sum(p.numel() for p in network.parameters())
+
+
+def describe(config: NetworkConfig) -> str:
+    """The shape of the network in one line, for logs and error messages."""
+    return json.dumps({"filters": config.filters, "layout": config.layout})

@@ -1,0 +1,68 @@
+"""Action policies (section 3.3): eps-greedy, roulette, and their mixture."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from shared.config import PolicyConfig
+
+ACTIONS = 3
+FORWARD, FORWARD_LEFT, FORWARD_RIGHT = range(ACTIONS)
+Values = npt.NDArray[np.float32]
+Floats = npt.NDArray[np.float64]
+
+
+def greedy_distribution(values: Values) -> Floats:
+    """All probability on argmax_a Q(s, a) (E12), shared equally between exact ties (E8)."""
+    best = values == values.max()
+    return best / best.sum()
+
+
+def roulette_distribution(values: Values, temperature: float) -> Floats:
+    """Softmax of Q / temperature (Fig 3.4); the maximum is subtracted first (E13)."""
+    scaled = (values.astype(np.float64) - float(values.max())) / temperature
+    weights = np.exp(scaled)
+    return np.asarray(weights / weights.sum())
+
+
+def exploring_distribution(values: Values, config: PolicyConfig) -> Floats:
+    """What the policy draws from when it does not act greedily."""
+    if config.kind == "eps-greedy":
+        return np.full(len(values), 1.0 / len(values))
+    return roulette_distribution(values, config.temperature)
+
+
+def distribution(values: Values, config: PolicyConfig) -> Floats:
+    """Probability of each action: float64 [actions], given clipped Q values [actions]."""
+    explore = exploring_distribution(values, config)
+    if config.kind == "roulette":
+        return explore
+    return (1.0 - config.epsilon) * greedy_distribution(values) + config.epsilon * explore
+
+
+def choose(values: Values, config: PolicyConfig, rng: np.random.Generator) -> tuple[int, bool]:
+    """Draw an action; also tell whether the greedy branch chose it (Fig 3.3-3.5).
+
+    values: float32 [actions], clipped predictions of the target network. Draws twice from `rng`:
+    first the branch (greedy if u >= epsilon), then the action.
+    """
+    branch, draw = rng.random(2)
+    greedy = config.kind != "roulette" and branch >= config.epsilon
+    chances = greedy_distribution(values) if greedy else exploring_distribution(values, config)
+    return _pick(chances, float(draw)), greedy
+
+
+def choose_uniformly(rng: np.random.Generator) -> int:
+    """A uniformly random action, to fill the memory before learning starts (E9)."""
+    return int(rng.integers(ACTIONS))
+
+
+def _pick(chances: Floats, draw: float) -> int:
+    """The action whose slice of [0, 1) holds `draw`; rounding can never pick an impossible one."""
+    possible = np.flatnonzero(chances)
+    index = int(np.searchsorted(np.cumsum(chances[possible]), draw, side="right"))
+    return int(possible[min(index, len(possible) - 1)])

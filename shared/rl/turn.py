@@ -1,0 +1,80 @@
+"""One turn in the order of E25, as far as it concerns the memory.
+
+append -> discard (candidates as needed) -> equalise -> (the learner:) train or fit -> target rule ->
+checkpoint -> publish. The replay service and the single-process loop both call these.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from shared.rl.equalisation import due, equalised
+from shared.rl.memory import SAMPLE, Ids, Images, ReplayMemory
+from shared.rl.predictor import Predictor, Progress
+from shared.rl.retention import Discard, discard
+
+if TYPE_CHECKING:
+    from shared.config import MemoryConfig
+    from shared.messages import Episode
+
+
+@dataclass(frozen=True)
+class Maintenance:
+    """What maintaining the memory after one submission did."""
+
+    discarded: Discard
+    equalised: bool
+    ids: Ids = field(default_factory=lambda: np.zeros(0, np.uint64))
+
+
+def sample_rows(
+    memory: ReplayMemory, episode: Episode, first_id: int, commit: int, number: int
+) -> tuple[np.ndarray, Images]:
+    """An episode's samples as rows and images for `ReplayMemory.append`.
+
+    first_id: insertion number of the first sample; commit: number of the submission; number: the
+    global episode number e, 0 while the memory is filled.
+    """
+    n = episode.count
+    rows = np.zeros(n, SAMPLE)
+    rows["id"] = np.arange(first_id, first_id + n)
+    rows["action"] = np.frombuffer(episode.sample_actions, np.uint8)
+    rows["reward"] = np.frombuffer(episode.sample_rewards, "<f4")
+    rows["commit"], rows["episode"] = commit, number
+    rows["robot_episode"] = np.frombuffer(episode.sample_episodes, "<u4")
+    rows["step"] = np.frombuffer(episode.sample_steps, "<u4")
+    rows["version"] = np.frombuffer(episode.sample_versions, "<u4")
+    worlds = memory.world_indices(episode.worlds)
+    rows["world"] = worlds[np.frombuffer(episode.sample_worlds, np.uint8)]
+    places = np.frombuffer(episode.positions, "<f4").reshape(n, 3)
+    rows["x_m"], rows["y_m"], rows["heading_rad"] = places.T
+    return rows, np.frombuffer(episode.images, np.uint8).reshape(n, 50, 75)
+
+
+def maintain(
+    memory: ReplayMemory,
+    number: int,
+    config: MemoryConfig,
+    threshold_percent: int,
+    predictor: Predictor,
+    *,
+    describing: Progress | None = None,
+    equalising: Progress | None = None,
+) -> Maintenance:
+    """Discard and, when due at episode `number`, equalise. `memory` is changed in place."""
+    dropped = discard(
+        memory,
+        config,
+        threshold_percent,
+        lambda images: predictor.descriptors(images, describing),
+        predictor.version,
+    )
+    refresh = due(number, config.equalise_every) and len(memory) > 0
+    if refresh:
+        images = memory.images(np.arange(len(memory)))
+        values = predictor.values(images, memory.rows["action"], equalising)
+        memory.rows["reward"] = equalised(memory.rows["reward"], values, config)
+    return Maintenance(dropped, refresh)
