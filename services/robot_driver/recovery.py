@@ -1,0 +1,61 @@
+"""What a robot does after a bump (E11): retreat by real motion, then turn on the spot.
+
+It uses nothing but `drive`, `run` and `sense`, so it serves simulated and real robots alike. The
+bumper has one bit for the whole ring: a pressed bumper cannot tell front from rear.
+"""
+
+from __future__ import annotations
+
+import math
+
+from services.robot_driver.robot import STANDSTILL, Pose, Robot, Velocity
+from shared.config import RobotConfig
+
+RELEASE_M = 0.05
+"""Way driven regardless of the bumper, to let go of the wall that pressed it."""
+
+
+def back_off(robot: Robot, config: RobotConfig, heading_rad: float) -> float:
+    """Retreat at most `recovery_distance_m`, then turn on the spot to `heading_rad` (odometry).
+
+    A wall behind ends the retreat; the robot then creeps forward half the way it had won, so that
+    it does not begin its next action against that wall. It stands still afterwards.
+
+    Returns:
+        Distance between the poses before and after, metres.
+
+    Raises:
+        RobotFault: The robot cannot be read or commanded.
+    """
+    start = robot.sense().pose
+    blocked = _move(robot, config, -config.recovery_distance_m)
+    here = robot.sense().pose
+    if blocked:
+        _move(robot, config, _distance(start, here) / 2.0)
+        here = robot.sense().pose
+    turn = math.remainder(heading_rad - here.heading_rad, 2.0 * math.pi)
+    robot.drive(Velocity(0.0, 0.0, math.copysign(config.turn_rad_s, turn)))
+    robot.run(abs(turn) / config.turn_rad_s, stop_on_contact=False)
+    robot.drive(STANDSTILL)
+    return _distance(start, here)
+
+
+def _move(robot: Robot, config: RobotConfig, distance_m: float) -> bool:
+    """Drive straight, backwards if negative; return whether a wall ended it."""
+    left = abs(distance_m)
+    speed = min(config.recovery_speed_m_s, config.max_speed_m_s)
+    pressed = robot.sense().contact
+    while left > 0.0:
+        part = min(left, RELEASE_M) if pressed else left
+        robot.drive(Velocity(math.copysign(speed, distance_m), 0.0, 0.0))
+        bumped = robot.run(part / speed, stop_on_contact=not pressed)
+        robot.drive(STANDSTILL)
+        if bumped and not pressed:
+            return True
+        left -= part
+        pressed = pressed and robot.sense().contact
+    return pressed
+
+
+def _distance(a: Pose, b: Pose) -> float:
+    return math.hypot(b.x_m - a.x_m, b.y_m - a.y_m)

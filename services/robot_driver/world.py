@@ -1,0 +1,265 @@
+"""Worlds as data: a TOML file in `worlds/` read into typed, checked, immutable objects.
+
+A world is a set of closed wall loops with free space on their left: the outer boundary runs
+anticlockwise, islands run clockwise. Every wall segment has a texture; fixtures (doors, windows,
+notice boards, radiators) are painted onto segments. Units are metres and degrees, x to the right
+and y up on the map.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+WORLDS = Path(__file__).parent / "worlds"
+"""Folder of the worlds that come with the driver."""
+
+Floats = npt.NDArray[np.float64]
+Text = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,40}$")]
+Length = Annotated[float, Field(gt=0.0, le=100.0)]
+Coordinate = Annotated[float, Field(ge=-1000.0, le=1000.0)]
+Point = Annotated[tuple[Coordinate, Coordinate], Field(strict=False)]
+Channel = Annotated[int, Field(ge=0, le=255)]
+Colour = Annotated[tuple[Channel, Channel, Channel], Field(strict=False)]
+"""Red, green, blue."""
+Material = Literal["plaster", "brick", "panelling", "tiles", "panels"]
+FixtureKind = Literal["door", "window", "board", "radiator"]
+
+
+class WorldError(Exception):
+    """A world file cannot be used; the message is one line naming file and key."""
+
+
+class _Part(BaseModel):
+    """Base of all parts of a world: frozen, strict, unknown keys refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class Texture(_Part):
+    """How a surface looks; painted by `textures`."""
+
+    kind: Material
+    rgb: Colour
+    """Main colour; for plaster the wall above the dado rail."""
+    accent: Colour = (96, 96, 96)
+    """Second colour: dado, mortar, joints."""
+
+
+class Surface(_Part):
+    """Floor or ceiling."""
+
+    texture: Text
+
+
+class Wall(_Part):
+    """A closed loop of wall segments; segment i runs from point i to the next, free on its left."""
+
+    name: Text
+    points: Annotated[tuple[Point, ...], Field(min_length=3, max_length=256, strict=False)]
+    textures: Annotated[tuple[Text, ...], Field(min_length=1, strict=False)]
+    """One per segment, or a single one for all."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if len(self.textures) not in (1, len(self.points)):
+            raise ValueError(
+                f"expected 1 or {len(self.points)} textures, one per segment, "
+                f"got {len(self.textures)}"
+            )
+        if bool(np.any(self.lengths < 0.01)):
+            raise ValueError("two neighbouring points are the same")
+        return self
+
+    @property
+    def segments(self) -> Floats:
+        """float64 [n, 4]: start x, y, end x, y."""
+        points = np.array(self.points, np.float64)
+        return np.hstack([points, np.roll(points, -1, axis=0)])
+
+    @property
+    def lengths(self) -> Floats:
+        """float64 [n], metres."""
+        s = self.segments
+        return np.hypot(s[:, 2] - s[:, 0], s[:, 3] - s[:, 1])
+
+    def texture_of(self, segment: int) -> str:
+        """Name of the texture of one segment."""
+        return self.textures[segment if len(self.textures) > 1 else 0]
+
+
+class Fixture(_Part):
+    """Something on a wall, painted, not solid beyond it."""
+
+    wall: Text
+    segment: Annotated[int, Field(ge=0)]
+    kind: FixtureKind
+    at_m: Annotated[float, Field(ge=0.0)]
+    """Distance of its middle from the start of the segment."""
+    width_m: Length
+    height_m: Length
+    bottom_m: Annotated[float, Field(ge=0.0)] = 0.0
+    """Height of its lower edge above the floor."""
+    rgb: Colour
+
+
+class Start(_Part):
+    """A pose from which a robot may start."""
+
+    x_m: Coordinate
+    y_m: Coordinate
+    heading_deg: Annotated[float, Field(ge=-360.0, le=360.0)]
+
+
+class Lap(_Part):
+    """How laps are counted: net angle round `centre`; `line` is only drawn."""
+
+    centre: Point
+    line: Annotated[tuple[Point, Point], Field(strict=False)]
+
+
+class World(_Part):
+    """One corridor (A3)."""
+
+    name: Text
+    title: Annotated[str, Field(min_length=1, max_length=200)]
+    height_m: Length
+    floor: Surface
+    ceiling: Surface
+    textures: dict[Text, Texture]
+    walls: Annotated[tuple[Wall, ...], Field(min_length=1, strict=False)]
+    fixtures: Annotated[tuple[Fixture, ...], Field(strict=False)] = ()
+    starts: Annotated[tuple[Start, ...], Field(min_length=1, strict=False)]
+    lap: Lap | None = None
+
+    @field_validator("walls")
+    @classmethod
+    def _walls_named_once(cls, walls: tuple[Wall, ...]) -> tuple[Wall, ...]:
+        names = [wall.name for wall in walls]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"two walls are named {twice[0]!r}")
+        return walls
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        self._check_textures()
+        for i, fixture in enumerate(self.fixtures):
+            self._check_fixture(f"fixtures.{i}", fixture)
+        for i, start in enumerate(self.starts):
+            if not self.free(np.array([[start.x_m, start.y_m]]))[0]:
+                raise ValueError(f"starts.{i}: ({start.x_m}, {start.y_m}) is not in free space")
+        if self.lap is not None and self.free(np.array([self.lap.centre]))[0]:
+            raise ValueError("lap.centre: a robot could drive over it; put it on an island")
+        return self
+
+    def _check_textures(self) -> None:
+        used = [("floor.texture", self.floor.texture), ("ceiling.texture", self.ceiling.texture)]
+        used += [
+            (f"walls.{i}.textures.{k}", name)
+            for i, wall in enumerate(self.walls)
+            for k, name in enumerate(wall.textures)
+        ]
+        for key, name in used:
+            if name not in self.textures:
+                raise ValueError(f"{key}: no texture named {name!r}")
+
+    def _check_fixture(self, key: str, fixture: Fixture) -> None:
+        wall = next((wall for wall in self.walls if wall.name == fixture.wall), None)
+        if wall is None:
+            raise ValueError(f"{key}.wall: no wall named {fixture.wall!r}")
+        if fixture.segment >= len(wall.points):
+            raise ValueError(f"{key}.segment: {fixture.wall!r} has {len(wall.points)} segments")
+        room = float(wall.lengths[fixture.segment])
+        half = fixture.width_m / 2
+        if fixture.at_m < half or fixture.at_m + half > room:
+            raise ValueError(f"{key}.at_m: does not fit onto a segment of {room:.2f} m")
+        if fixture.bottom_m + fixture.height_m > self.height_m:
+            raise ValueError(f"{key}.height_m: higher than the wall ({self.height_m} m)")
+
+    @cached_property
+    def segments(self) -> Floats:
+        """float64 [n, 4] of all walls: start x, y, end x, y; free space on the left."""
+        return np.vstack([wall.segments for wall in self.walls])
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """16 hex digits over everything in the file."""
+        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Smallest x, y, largest x, y of all walls."""
+        xy = self.segments.reshape(-1, 2)
+        low, high = xy.min(axis=0), xy.max(axis=0)
+        return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+    def free(self, points: Floats) -> npt.NDArray[np.bool_]:
+        """Whether points float64 [n, 2] lie between the walls: inside the boundary, off islands."""
+        x, y = points[:, 0, None], points[:, 1, None]
+        ax, ay, bx, by = self.segments.T[:, None, :]
+        spans = (ay > y) != (by > y)
+        rise = np.where(by == ay, 1.0, by - ay)
+        crosses = spans & (x < ax + (y - ay) / rise * (bx - ax))
+        return np.asarray(np.count_nonzero(crosses, axis=1) % 2 == 1)
+
+    def distance(self, points: Floats) -> Floats:
+        """Distance of points float64 [n, 2] to the nearest wall, float64 [n], metres."""
+        start, end = self.segments[:, :2], self.segments[:, 2:]
+        along = end - start
+        length2 = np.einsum("ij,ij->i", along, along)
+        offset = points[:, None, :] - start
+        t = np.clip(np.einsum("nsj,sj->ns", offset, along) / length2, 0.0, 1.0)
+        gap = offset - t[..., None] * along
+        return np.asarray(np.sqrt(np.einsum("nsj,nsj->ns", gap, gap).min(axis=1)))
+
+    def clearance(self, points: Floats) -> Floats:
+        """Distance to the nearest wall, negative off free space; float64 [n, 2] to float64 [n]."""
+        distance = self.distance(points)
+        return np.where(self.free(points), distance, -distance)
+
+
+def load_world(name: str) -> World:
+    """The world of that name among those that come with the driver.
+
+    Raises:
+        WorldError: There is none of that name, or its file is wrong.
+    """
+    path = WORLDS / f"{name}.toml"
+    if not path.is_file():
+        known = ", ".join(sorted(file.stem for file in WORLDS.glob("*.toml")))
+        raise WorldError(f"no world named {name!r}; there are: {known}")
+    return read_world(path)
+
+
+def read_world(path: Path) -> World:
+    """Read and check one world file.
+
+    Raises:
+        WorldError: One line: file, key, what is wrong.
+    """
+    try:
+        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise WorldError(f"{path.name}: {error}") from error
+    try:
+        world = World.model_validate(tree)
+    except ValidationError as error:
+        raise WorldError(f"{path.name}: {_first_line(error)}") from error
+    if world.name != path.stem:
+        raise WorldError(f"{path.name}: name: {world.name!r} does not match the file name")
+    return world
+
+
+def _first_line(error: ValidationError) -> str:
+    first = error.errors(include_url=False, include_context=False)[0]
+    key = ".".join(str(part) for part in first["loc"])
+    text = first["msg"].removeprefix("Value error, ")
+    return f"{key}: {text}" if key else text
