@@ -1,1 +1,1 @@
-""""""
+"""The router service: where all other services meet."""

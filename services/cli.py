@@ -1,0 +1,357 @@
+"""The command line `corridor`: every service alone, all together, and a look at what runs.
+
+Commands import what they need when they run: `corridor driver` works without torch, `corridor
+actor` without pybullet, and `--help` is quick.
+
+Exit codes: 0 done, 1 crash or nobody answers, 2 wrong configuration or usage (one line), 3 what
+lies on disk is damaged or does not belong to this run.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from services.monitor.tether import tether
+from services.options import (
+    CHOOSE,
+    ConfigFile,
+    Endpoint,
+    Preset,
+    Robot,
+    Run,
+    RunDir,
+    Seed,
+    Set,
+    Tethered,
+)
+from shared.errors import ConfigError, CorridorError, StateError
+
+if TYPE_CHECKING:
+    from services.monitor.operator import Command
+    from shared.config import Config
+
+EXIT_CRASH, EXIT_CONFIG, EXIT_STATE = 1, 2, 3
+UsageError = typer.BadParameter.__mro__[2]
+"""Base of all complaints about the command line, wherever this version of Typer keeps Click."""
+
+app = typer.Typer(
+    help="A robot teaches itself to drive through corridors from one camera.",
+    epilog="Exit codes: 0 done, 1 crash or no answer, 2 wrong configuration or usage, 3 bad state.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+world = typer.Typer(help="Look at a simulated world without driving in it.", no_args_is_help=True)
+app.add_typer(world, name="world")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; every expected failure becomes one line and an exit code."""
+    try:
+        code = app(arguments, prog_name="corridor", standalone_mode=False)
+    except ConfigError as error:
+        return _fail(str(error), EXIT_CONFIG)
+    except StateError as error:
+        return _fail(str(error), EXIT_STATE)
+    except CorridorError as error:
+        return _fail(str(error), EXIT_CRASH)
+    except UsageError as error:
+        return _fail(error.format_message(), EXIT_CONFIG)  # type: ignore[attr-defined]
+    return code if isinstance(code, int) else 0
+
+
+def _fail(message: str, code: int) -> int:
+    """Say in one line what went wrong; the source lines Zenoh appends help nobody here."""
+    line = " ".join(re.sub(r" at \S+\.rs:\d+\.?", "", message).split())
+    if line:  # empty after the help that a call without arguments shows
+        typer.echo(f"corridor: {line}", err=True)
+    return code
+
+
+# ---------------------------------------------------------------- services
+
+
+def _service_command(name: str, package: str, text: str) -> None:
+    """Add the command that runs one service in this process."""
+
+    def command(
+        preset: Preset = None,
+        config: ConfigFile = None,
+        set_: Set = None,
+        seed: Seed = None,
+        run: Run = None,
+        run_dir: RunDir = None,
+        endpoint: Endpoint = None,
+        tethered: Tethered = False,
+    ) -> None:
+        loaded = _load(preset, config, set_, run, seed, endpoint)
+        raise typer.Exit(_serve(package, loaded, run_dir or _folder(loaded), tethered))
+
+    app.command(name, help=text)(command)
+
+
+_service_command(
+    "driver",
+    "robot_driver",
+    "Drive one robot: camera, motion, limits, bumper reflex, emergency stop.",
+)
+_service_command(
+    "actor", "actor", "Choose actions with the target network and hand episodes to replay."
+)
+_service_command(
+    "replay", "replay", "Keep the replay memory on disk: store, discard, equalise, serve changes."
+)
+_service_command(
+    "learner", "learner", "Train the network, keep checkpoints, publish the target network."
+)
+
+
+@app.command()
+def router(
+    preset: Preset = None,
+    config: ConfigFile = None,
+    set_: Set = None,
+    listen: Annotated[
+        str | None,
+        typer.Option(
+            help="Where to listen; default bus.endpoint, which is loopback only. Port 0 takes a "
+            "free port. Example for all interfaces: tcp/0.0.0.0:7447."
+        ),
+    ] = None,
+    tethered: Tethered = False,
+) -> None:
+    """Run a Zenoh router; the first line on standard output is where it listens."""
+    loaded = _load(preset, config, set_, endpoint=listen)
+    if tethered:
+        tether()
+    from services.router.service import run as route
+
+    route(loaded.bus.endpoint, typer.echo)
+
+
+@app.command()
+def up(
+    preset: Preset = None,
+    config: ConfigFile = None,
+    set_: Set = None,
+    run: Run = None,
+    seed: Seed = None,
+    run_dir: RunDir = None,
+    endpoint: Annotated[
+        str | None,
+        typer.Option(
+            help="Use the router at this endpoint instead of starting one.",
+            rich_help_panel=CHOOSE,
+        ),
+    ] = None,
+    listen: Annotated[
+        str | None,
+        typer.Option(
+            help="Where the own router listens; default: loopback, a free port.",
+            rich_help_panel=CHOOSE,
+        ),
+    ] = None,
+    episodes: Annotated[
+        int | None,
+        typer.Option(help="End by itself after so many episodes (run.episodes); 0: never."),
+    ] = None,
+) -> None:
+    """Start router, replay, learner, actor and driver, and show how the robot learns.
+
+    Ctrl-C stops everything within five seconds; the same command continues the run. All that a
+    run produces lies in its folder.
+    """
+    loaded = _load(preset, config, set_, run, seed, endpoint, **{"run.episodes": episodes})
+    from services.monitor.up import run_all
+
+    code = run_all(loaded, run_dir or _folder(loaded), listen=listen, given=endpoint is not None)
+    raise typer.Exit(code)
+
+
+# ---------------------------------------------------------------- looking and commanding
+
+
+@app.command()
+def status(
+    run: Run = None,
+    run_dir: RunDir = None,
+    endpoint: Endpoint = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    require: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SERVICE",
+            help="Exit with 1 unless this service answers; repeatable (for health checks).",
+        ),
+    ] = None,
+) -> None:
+    """List the services of a run that are alive, with versions, rates and memory."""
+    from services.monitor.status import show
+
+    raise typer.Exit(show(_reach(run, run_dir, endpoint), as_json=as_json, require=require or []))
+
+
+@app.command()
+def stop(
+    run: Run = None,
+    run_dir: RunDir = None,
+    endpoint: Endpoint = None,
+    service: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SERVICE", help="Only this service (robot_driver, actor, ...); repeatable."
+        ),
+    ] = None,
+) -> None:
+    """Ask the services of a run to stop cleanly; `corridor up` ends with them."""
+    from services.monitor.operator import stop_services
+
+    raise typer.Exit(stop_services(_reach(run, run_dir, endpoint), service or []))
+
+
+@app.command()
+def estop(
+    run: Run = None, run_dir: RunDir = None, endpoint: Endpoint = None, robot: Robot = None
+) -> None:
+    """Stop robots at once; they stay stopped until `corridor clear`."""
+    _command_robots("estop", _reach(run, run_dir, endpoint), robot)
+
+
+@app.command()
+def clear(
+    run: Run = None, run_dir: RunDir = None, endpoint: Endpoint = None, robot: Robot = None
+) -> None:
+    """Release the emergency stop of robots."""
+    _command_robots("clear", _reach(run, run_dir, endpoint), robot)
+
+
+@app.command()
+def pause(
+    run: Run = None, run_dir: RunDir = None, endpoint: Endpoint = None, robot: Robot = None
+) -> None:
+    """Let robots wait after the current action; they go on with `corridor resume`."""
+    _command_robots("pause", _reach(run, run_dir, endpoint), robot)
+
+
+@app.command()
+def resume(
+    run: Run = None, run_dir: RunDir = None, endpoint: Endpoint = None, robot: Robot = None
+) -> None:
+    """Let paused robots drive on."""
+    _command_robots("resume", _reach(run, run_dir, endpoint), robot)
+
+
+# ---------------------------------------------------------------- without a run
+
+
+@app.command("config")
+def show_config(preset: Preset = None, config: ConfigFile = None, set_: Set = None) -> None:
+    """Print the resolved configuration as TOML, every key with its value."""
+    from shared.settings import to_toml
+
+    typer.echo(to_toml(_load(preset, config, set_)), nl=False)
+
+
+@world.command("render")
+def world_render(
+    name: Annotated[str, typer.Argument(help="Name of the world, such as plus.")],
+    out: Annotated[Path, typer.Option(help="Folder for the PNG files.")] = Path("renders"),
+) -> None:
+    """Write a top view and camera views of a world as PNG files."""
+    survey = _import("services.robot_driver.survey", "robot_driver")
+    survey.render(name, out)
+    typer.echo(f"written to {out}")
+
+
+@world.command("check")
+def world_check(
+    name: Annotated[str, typer.Argument(help="Name of the world, such as plus.")],
+    preset: Preset = None,
+    config: ConfigFile = None,
+    set_: Set = None,
+) -> None:
+    """Measure a world: lap length, corridor width, turning circle, how many poses can be saved."""
+    loaded = _load(preset, config, set_, **{"robot.world": name})
+    survey = _import("services.robot_driver.survey", "robot_driver")
+    for key, value in survey.survey(loaded).items():
+        typer.echo(f"{key:40} {value:.3f}" if isinstance(value, float) else f"{key:40} {value}")
+
+
+# ---------------------------------------------------------------- shared by the commands
+
+
+def _load(
+    preset: str | None = None,
+    file: Path | None = None,
+    sets: list[str] | None = None,
+    run: str | None = None,
+    seed: int | None = None,
+    endpoint: str | None = None,
+    **dedicated: str | int | None,
+) -> Config:
+    """The configuration from all sources; dedicated options win over `--set`."""
+    from shared import settings
+
+    options = {"run.name": run, "run.seed": seed, "bus.endpoint": endpoint, **dedicated}
+    chosen = [f"{k}={settings.toml_value(v)}" for k, v in options.items() if v is not None]
+    return settings.load(preset, file, [*(sets or []), *chosen], os.environ)
+
+
+def _folder(config: Config) -> Path:
+    """The default folder of a run."""
+    return Path("runs") / config.run.name
+
+
+def _serve(package: str, config: Config, folder: Path, tethered: bool) -> int:
+    """Run one service until it stops; returns its exit code."""
+    if tethered:
+        tether()
+    from shared.service import guarded, setup_logging
+    from shared.settings import claim
+
+    claim(folder, config)
+    setup_logging(package, folder)
+
+    def run() -> None:
+        _import(f"services.{package}.service", package).run(config, folder)
+
+    return guarded(package, run)
+
+
+def _import(module: str, role: str) -> Any:
+    """A module of ours. Raises ConfigError when a library of this role is not installed."""
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if (error.name or "").split(".")[0] in {"services", "shared"}:
+            raise
+        extra = "sim" if role == "robot_driver" else role
+        raise ConfigError(
+            f"{role}: needs the Python package {error.name}, which is not installed: "
+            f"pip install 'corridor[{extra}]'"
+        ) from error
+
+
+def _reach(run: str | None, run_dir: Path | None, endpoint: str | None) -> Config:
+    """How to reach a running run."""
+    from services.monitor.running import reach
+
+    return reach(run_dir, run, endpoint, os.environ)
+
+
+def _command_robots(command: Command, config: Config, robot: str | None) -> None:
+    from services.monitor.operator import command_robots
+
+    raise typer.Exit(command_robots(config, command, robot))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,104 @@
+"""Which runs are up on this machine, and how to reach a run.
+
+A run folder is in use while `corridor up` holds the lock on its `lock` file; the kernel lets go of
+the lock when the process ends, however it ends. Beside it, the file `endpoint` tells where the
+router of that run listens.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from shared import settings
+from shared.config import Config
+from shared.errors import ConfigError
+
+RUNS = Path("runs")
+LOCK_WAIT_S = 1.0
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold the run folder for this process. Raises ConfigError while another one holds it."""
+    deadline_s = time.monotonic() + LOCK_WAIT_S
+    with (folder / "lock").open("a+") as stream:
+        # Somebody who only looks holds the lock for an instant: try more than once.
+        while not _try_lock(stream.fileno(), fcntl.LOCK_EX):
+            if time.monotonic() > deadline_s:
+                stream.seek(0)
+                owner = stream.read().strip()
+                raise ConfigError(
+                    f"run folder {folder} is in use by `corridor up`, process {owner}"
+                )
+            time.sleep(0.05)
+        stream.truncate(0)
+        stream.write(f"{os.getpid()}\n")
+        stream.flush()
+        try:
+            yield
+        finally:
+            (folder / "endpoint").unlink(missing_ok=True)
+            stream.truncate(0)
+
+
+def is_up(folder: Path) -> bool:
+    """Whether a `corridor up` holds this run folder now."""
+    try:
+        with (folder / "lock").open() as stream:
+            return not _try_lock(stream.fileno(), fcntl.LOCK_SH)
+    except OSError:
+        return False
+
+
+def reach(
+    run_dir: Path | None = None,
+    run: str | None = None,
+    endpoint: str | None = None,
+    env: Mapping[str, str] | None = None,
+) -> Config:
+    """The configuration by which a running run is reached from outside.
+
+    A given endpoint (option or environment) is taken as it is. Otherwise the run that is up in
+    `run_dir`, or the only one in `runs/`, is meant; without one, the default endpoint.
+
+    Raises:
+        ConfigError: several runs are up and none was chosen.
+    """
+    chosen = {"run.name": run, "bus.endpoint": endpoint}
+    overrides = [f"{key}={settings.toml_value(v)}" for key, v in chosen.items() if v is not None]
+    plain = settings.load(overrides=overrides, env=env)
+    if endpoint is not None or "CORRIDOR_BUS__ENDPOINT" in (env or {}):
+        return plain
+    if run_dir is not None:
+        return _of_folder(run_dir, overrides)
+    up = [folder for folder in sorted(RUNS.glob("*")) if is_up(folder)]
+    if run is not None:
+        up = [folder for folder in up if settings.read_folder(folder).run.name == run]
+    if len(up) > 1:
+        raise ConfigError(
+            f"several runs are up, choose one by --run-dir: {', '.join(map(str, up))}"
+        )
+    return _of_folder(up[0], overrides) if up else plain
+
+
+def _of_folder(folder: Path, overrides: list[str]) -> Config:
+    """The stored configuration with the endpoint the run uses now."""
+    stored = settings.read_folder(folder)
+    now = stored.bus.endpoint
+    with suppress(FileNotFoundError):
+        now = (folder / "endpoint").read_text().strip()
+    overrides = [f"bus.endpoint={settings.toml_value(now)}", *overrides]
+    return settings.load(file=folder / settings.FILE_NAME, overrides=overrides)
+
+
+def _try_lock(descriptor: int, kind: int) -> bool:
+    try:
+        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True

@@ -1,0 +1,40 @@
+"""Our own router: a Zenoh session in router mode, for runs on one machine.
+
+Spread-out installations may use the official `zenohd` in its place; services cannot tell them
+apart.
+"""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+from collections.abc import Callable
+
+from shared.bus import open_router
+
+log = logging.getLogger(__name__)
+
+
+def run(endpoint: str, announce: Callable[[str], None]) -> None:
+    """Route until SIGTERM or SIGINT.
+
+    Args:
+        endpoint: where to listen; port 0 takes a free one.
+        announce: called once with the locator that clients connect to.
+
+    Raises:
+        ConfigError: it cannot listen there.
+    """
+    stop = threading.Event()
+
+    def on_signal(*_: object) -> None:
+        stop.set()
+
+    signal.signal(signal.SIGTERM, on_signal)
+    signal.signal(signal.SIGINT, on_signal)
+    with open_router(endpoint) as locator:
+        log.info("router listens on %s", locator)
+        announce(locator)
+        stop.wait()
+    log.info("router stops")
