@@ -13,7 +13,7 @@ import importlib
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from shared.config import Config
 
 EXIT_CRASH, EXIT_CONFIG, EXIT_STATE = 1, 2, 3
-UsageError = typer.BadParameter.__mro__[2]
+UsageError: Any = typer.BadParameter.__mro__[2]
 """Base of all complaints about the command line, wherever this version of Typer keeps Click."""
 
 app = typer.Typer(
@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except CorridorError as error:
         return _fail(str(error), EXIT_CRASH)
     except UsageError as error:
-        return _fail(error.format_message(), EXIT_CONFIG)  # type: ignore[attr-defined]
+        return _fail(error.format_message(), EXIT_CONFIG)
     return code if isinstance(code, int) else 0
 
 
@@ -169,7 +169,7 @@ def up(
     Ctrl-C stops everything within five seconds; the same command continues the run. All that a
     run produces lies in its folder.
     """
-    loaded = _load(preset, config, set_, run, seed, endpoint, **{"run.episodes": episodes})
+    loaded = _load(preset, config, set_, run, seed, endpoint, {"run.episodes": episodes})
     from services.monitor.up import run_all
 
     code = run_all(loaded, run_dir or _folder(loaded), listen=listen, given=endpoint is not None)
@@ -279,7 +279,7 @@ def world_check(
     set_: Set = None,
 ) -> None:
     """Measure a world: lap length, corridor width, turning circle, how many poses can be saved."""
-    loaded = _load(preset, config, set_, **{"robot.world": name})
+    loaded = _load(preset, config, set_, others={"robot.world": name})
     survey = _import("services.robot_driver.survey", "robot_driver")
     for key, value in survey.survey(loaded).items():
         typer.echo(f"{key:40} {value:.3f}" if isinstance(value, float) else f"{key:40} {value}")
@@ -295,12 +295,17 @@ def _load(
     run: str | None = None,
     seed: int | None = None,
     endpoint: str | None = None,
-    **dedicated: str | int | None,
+    others: Mapping[str, str | int | None] | None = None,
 ) -> Config:
     """The configuration from all sources; dedicated options win over `--set`."""
     from shared import settings
 
-    options = {"run.name": run, "run.seed": seed, "bus.endpoint": endpoint, **dedicated}
+    options: dict[str, str | int | None] = {
+        "run.name": run,
+        "run.seed": seed,
+        "bus.endpoint": endpoint,
+    }
+    options.update(others or {})
     chosen = [f"{k}={settings.toml_value(v)}" for k, v in options.items() if v is not None]
     return settings.load(preset, file, [*(sets or []), *chosen], os.environ)
 

@@ -19,19 +19,28 @@ from shared.config import Config
 from shared.errors import ConfigError
 
 RUNS = Path("runs")
-LOCK_WAIT_S = 1.0
+LOOKING_S, ORPHANS_S = 1.0, 6.0
+"""How long a taken lock is waited for while its owner lives, and after its death."""
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Hold the run folder for this process. Raises ConfigError while another one holds it."""
-    deadline_s = time.monotonic() + LOCK_WAIT_S
+def locked(folder: Path) -> Iterator[int]:
+    """Hold the run folder for this process; yields the descriptor that holds the lock.
+
+    Children that inherit the descriptor hold the lock too: a run counts as up until the last
+    process of it is gone, also after its supervisor was killed.
+
+    Raises:
+        ConfigError: another `corridor up` holds it.
+    """
+    start_s = time.monotonic()
     with (folder / "lock").open("a+") as stream:
-        # Somebody who only looks holds the lock for an instant: try more than once.
         while not _try_lock(stream.fileno(), fcntl.LOCK_EX):
-            if time.monotonic() > deadline_s:
-                stream.seek(0)
-                owner = stream.read().strip()
+            stream.seek(0)
+            owner = stream.read().strip()
+            # Others may look at the lock for an instant, and orphans need a moment to end.
+            patience_s = LOOKING_S if _is_process(owner) else ORPHANS_S
+            if time.monotonic() - start_s > patience_s:
                 raise ConfigError(
                     f"run folder {folder} is in use by `corridor up`, process {owner}"
                 )
@@ -40,10 +49,20 @@ def locked(folder: Path) -> Iterator[None]:
         stream.write(f"{os.getpid()}\n")
         stream.flush()
         try:
-            yield
+            yield stream.fileno()
         finally:
             (folder / "endpoint").unlink(missing_ok=True)
             stream.truncate(0)
+
+
+def _is_process(pid: str) -> bool:
+    try:
+        os.kill(int(pid), 0)
+    except (ValueError, ProcessLookupError):
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def is_up(folder: Path) -> bool:
@@ -91,7 +110,9 @@ def _of_folder(folder: Path, overrides: list[str]) -> Config:
     stored = settings.read_folder(folder)
     now = stored.bus.endpoint
     with suppress(FileNotFoundError):
-        now = (folder / "endpoint").read_text().strip()
+        # Left behind by a killed supervisor it means nothing.
+        if is_up(folder):
+            now = (folder / "endpoint").read_text().strip()
     overrides = [f"bus.endpoint={settings.toml_value(now)}", *overrides]
     return settings.load(file=folder / settings.FILE_NAME, overrides=overrides)
 

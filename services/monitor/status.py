@@ -1,0 +1,170 @@
+"""`corridor status`: who is alive in a run, and what each last told about itself."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import typer
+from rich.console import Console, Group, RenderableType
+from rich.table import Table
+
+from services.monitor.heartbeats import Reader, Snapshot
+from services.monitor.live import by_action, duration, fitness, learner_doing, replay_doing
+from services.monitor.live import threshold as threshold_text
+from shared.bus import Bus
+from shared.config import Config
+from shared.errors import BadMessage, BusError
+from shared.keys import SERVICE, Peer
+from shared.messages import ServiceCommand, ServiceReply
+
+PING_S = 1.0
+HEARTBEATS = 2.5
+"""How many periods to wait for the heartbeats of those who are there."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One service that is alive, and its answer to a ping."""
+
+    peer: Peer
+    reply: ServiceReply | None
+    """None: it did not answer."""
+
+
+def show(config: Config, *, as_json: bool, require: Sequence[str]) -> int:
+    """Print the state of a run.
+
+    Args:
+        config: how to reach the run.
+        as_json: print one JSON object instead of tables.
+        require: services that must answer.
+
+    Returns:
+        0, or 1 if a required service does not answer.
+
+    Raises:
+        RouterMissing: there is no router.
+    """
+    with Bus(config.bus, config.run.name) as bus:
+        reader = Reader(inbox := bus.inbox())
+        entries = [Entry(peer, _ping(bus, peer)) for peer in bus.peers()]
+        deadline_s = time.monotonic() + HEARTBEATS * config.bus.heartbeat_s
+        while not _complete(entries, reader.snapshot()) and time.monotonic() < deadline_s:
+            inbox.wait(0.1)
+            reader.update()
+        snapshot = reader.snapshot()
+    if as_json:
+        typer.echo(json.dumps(as_dict(config, entries, snapshot), indent=2))
+    else:
+        Console().print(report(config, entries, snapshot))
+    answering = {entry.peer.service for entry in entries if entry.reply is not None}
+    missing = [name for name in require if name not in answering]
+    if missing:
+        typer.echo(f"corridor: no answer from {', '.join(missing)}", err=True)
+    return 1 if missing else 0
+
+
+def as_dict(config: Config, entries: Sequence[Entry], snapshot: Snapshot) -> dict[str, Any]:
+    """Everything known, ready for JSON."""
+    replay, learner = snapshot.replay, snapshot.learner
+    return {
+        "run": config.run.name,
+        "endpoint": config.bus.endpoint,
+        "services": [
+            {
+                "service": entry.peer.service,
+                "id": entry.peer.id,
+                "life": entry.peer.life,
+                "protocol": entry.peer.protocol,
+                "config": entry.peer.config,
+                "answers": entry.reply is not None,
+                "pid": entry.reply.pid if entry.reply else None,
+                "version": entry.reply.version if entry.reply else None,
+                "uptime_s": entry.reply.uptime_s if entry.reply else None,
+            }
+            for entry in entries
+        ],
+        "robots": {name: seen.message.model_dump() for name, seen in snapshot.robots.items()},
+        "actors": {name: seen.message.model_dump() for name, seen in snapshot.actors.items()},
+        "replay": replay.message.model_dump() if replay else None,
+        "learner": learner.message.model_dump() if learner else None,
+    }
+
+
+def report(config: Config, entries: Sequence[Entry], snapshot: Snapshot) -> RenderableType:
+    """Everything known, as tables."""
+    title = f"run {config.run.name} at {config.bus.endpoint}"
+    if not entries:
+        return f"{title}: no service is alive"
+    parts: list[RenderableType] = [_services(title, entries)]
+    facts = Table.grid(padding=(0, 2))
+    for row in _facts(snapshot):
+        facts.add_row(*row)
+    return Group(*parts, facts) if facts.row_count else Group(*parts)
+
+
+def _services(title: str, entries: Sequence[Entry]) -> Table:
+    table = Table(title=title, title_justify="left")
+    for column in ("service", "id", "pid", "up", "version", "life", "configuration"):
+        table.add_column(column, no_wrap=True)
+    for entry in entries:
+        peer, reply = entry.peer, entry.reply
+        told = (
+            (str(reply.pid), duration(reply.uptime_s), reply.version)
+            if reply
+            else ("-", "no answer", "-")
+        )
+        table.add_row(peer.service, peer.id, *told, peer.life, peer.config)
+    return table
+
+
+def _facts(snapshot: Snapshot) -> list[tuple[str, str]]:
+    """What the heartbeats tell, by service."""
+    rows = []
+    for name, robot in snapshot.robots.items():
+        r = robot.message
+        text = f"{r.state} in {r.world}, action {r.sequence}, bumps {r.bumps}, "
+        text += f"laps {r.laps_left} left {r.laps_right} right"
+        rows.append((f"robot {name}", text))
+    for name, actor in snapshot.actors.items():
+        a = actor.message
+        text = f"{a.phase}, {a.actions_per_s:.1f} steps per second, weights {a.weights_version}"
+        rows.append((f"actor of {name}", text))
+    if snapshot.replay is not None:
+        m = snapshot.replay.message
+        text = f"episode {m.episode}, fitness {fitness(m)}, {replay_doing(m)}, "
+        text += f"weights {m.weights_version}"
+        rows.append(("replay", text))
+        text = f"{m.size} of {m.capacity}: {by_action(m.by_action)}, "
+        text += f"threshold {threshold_text(m)}"
+        rows.append(("memory", text))
+    if snapshot.learner is not None:
+        n = snapshot.learner.message
+        text = f"{learner_doing(n)}, episode {n.episode} done, weights {n.weights_version}, "
+        text += f"{n.train_steps} training steps"
+        rows.append(("learner", text))
+    return rows
+
+
+def _ping(bus: Bus, peer: Peer) -> ServiceReply | None:
+    ident = f"{peer.service}-{peer.id}"
+    message = ServiceCommand(command="ping")
+    try:
+        return bus.request(SERVICE, message, ServiceReply, ident=ident, timeout_s=PING_S)
+    except (BusError, BadMessage, ValueError):  # an id from outside may be too long for a key
+        return None
+
+
+def _complete(entries: Sequence[Entry], snapshot: Snapshot) -> bool:
+    """Whether everybody who is there has told something."""
+    told = {
+        "robot_driver": bool(snapshot.robots),
+        "actor": bool(snapshot.actors),
+        "replay": snapshot.replay is not None,
+        "learner": snapshot.learner is not None,
+    }
+    return all(told.get(entry.peer.service, True) for entry in entries)
