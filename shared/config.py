@@ -76,7 +76,7 @@ class RobotConfig(Section):
     """Time one action lasts."""
     speed_m_s: float = Field(default=0.6, gt=0.0, le=2.0)
     """Forward speed of all three actions (A21, E31)."""
-    turn_rad_s: float = Field(default=math.radians(60.0), gt=0.0, le=3.0)
+    turn_rad_s: float = Field(default=math.radians(80.0), gt=0.0, le=3.0)
     """Turn rate of forward/left and forward/right (A21, E31)."""
     max_speed_m_s: float = Field(default=0.8, gt=0.0, le=2.0)
     """Clamp: commands are cut to it."""
@@ -88,7 +88,7 @@ class RobotConfig(Section):
     """Lockstep: an unanswered observation is sent again after this wall-clock time."""
     recovery: Literal["back-off", "none"] = "back-off"
     """What the driver does after a bump (E11); `none` is the literal variant."""
-    recovery_distance_m: float = Field(default=0.3, gt=0.0, le=1.0)
+    recovery_distance_m: float = Field(default=0.5, gt=0.0, le=1.0)
     recovery_speed_m_s: float = Field(default=0.2, gt=0.0, le=0.5)
     radius_m: float = Field(default=0.225, gt=0.0, le=1.0)
     """Round shell with the ring bumper."""

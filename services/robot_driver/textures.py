@@ -109,17 +109,18 @@ def _plaster(canvas: Canvas, texture: Texture) -> None:
 
 
 def _brick(canvas: Canvas, texture: Texture) -> None:
-    """Running bond of large bricks; the joints lie in the accent colour."""
+    """Running bond of large bricks with joints in the accent colour, dark skirting board."""
     h, w = canvas.shape[:2]
     canvas[:] = texture.accent
-    length, course, joint = 0.40, 0.14, 0.022
+    length, course, joint = 0.40, 0.16, 0.025
     for row in range(math.ceil(h / _DRAW / course)):
         shift = length / 2 * (row % 2)
         for column in range(-1, math.ceil(w / _DRAW / length) + 1):
-            rgb = _mix(texture.rgb, 1.0 + 0.16 * _variation(row, column))
+            rgb = _mix(texture.rgb, 1.0 + 0.08 * _variation(row, column))
             x, y = column * length + shift, row * course
             if x + length > 0:
                 _box(canvas, max(x, 0.0), y, length - joint + min(x, 0.0), course - joint, rgb)
+    _box(canvas, 0.0, 0.0, w / _DRAW, 0.12, _mix(texture.rgb, 0.4))
 
 
 def _panelling(canvas: Canvas, texture: Texture) -> None:
@@ -130,7 +131,7 @@ def _panelling(canvas: Canvas, texture: Texture) -> None:
     for column in range(math.ceil(w / board)):
         _box(
             canvas, column * board, 0.0, board, top,
-            _mix(texture.rgb, 1.0 + 0.14 * _variation(1, column)),
+            _mix(texture.rgb, 1.0 + 0.1 * _variation(1, column)),
         )  # fmt: skip
         _box(canvas, column * board, 0.0, 0.03, top, texture.accent)
     _box(canvas, 0.0, top, w, 0.08, texture.accent)
@@ -198,8 +199,8 @@ def _radiator(canvas: Canvas, fixture: Fixture, length: float, height: float) ->
     """Ribs with dark gaps."""
     del height
     x, y, w, h = _place(fixture, length)
-    _box(canvas, x, y, w, h, _mix(fixture.rgb, 0.5))
-    ribs = max(1, round(w / 0.12))
+    _box(canvas, x, y, w, h, _mix(fixture.rgb, 0.65))
+    ribs = max(1, round(w / 0.2))
     for k in range(ribs):
         _box(canvas, x + w * k / ribs, y, w / ribs * 0.66, h, fixture.rgb)
     _box(canvas, x, y + h - 0.05, w, 0.05, fixture.rgb)
