@@ -57,6 +57,8 @@ class Observation(Message):
     life: Life
     sequence: Count
     """Grows by one per executed action; the action that answers it carries the same number."""
+    attempt: Count = 0
+    """Fresh looks at the same sequence: after a hold, a late action or an interruption."""
     image: Image
     x_m: float
     y_m: float
@@ -82,6 +84,8 @@ class Action(Message):
     robot_life: Life
     sequence: Count
     """Of the observation answered; the driver ignores any other than the one it waits on."""
+    attempt: Count = 0
+    """Of the observation answered."""
     action: Annotated[int, Field(ge=0, le=2)] | None
     """0 forward, 1 forward/left, 2 forward/right (A21); None: hold still for one period."""
     greedy: bool

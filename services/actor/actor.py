@@ -39,6 +39,8 @@ class Actor:
         self._unreported_episodes = 0
         self._actions_before = 0
         self._laps_before = (0, 0)
+        self.at_boundary = True
+        """No action of the current episode was chosen yet: here weights may change."""
         self._expected: tuple[str, int] | None = None
         """Driver life and sequence of the observation that continues the open episode."""
 
@@ -57,10 +59,10 @@ class Actor:
         self._laps_before = (observation.laps_left, observation.laps_right)
         if self._expected == (observation.life, observation.sequence):
             return  # continues after a clean stop: nothing is lost
-        if progress.robot_life == observation.life:
+        if progress.robot_life in ("", observation.life):
             lost = observation.sequence - (progress.last_sequence + 1)
             self._drop(samples=lost, episodes=int(lost > 0))
-        elif progress.robot_life:
+        else:
             self._drop(samples=0, episodes=1)
 
     def finish(self, observation: Observation) -> Episode | None:
@@ -72,6 +74,7 @@ class Actor:
         if ending is None:
             return None
         release = self.open.end(ending)
+        self.at_boundary = True
         if ending == "interrupted":
             self._drop(samples=release.dropped, episodes=int(release.count == 0))
         if release.count == 0:
@@ -120,12 +123,14 @@ class Actor:
             )
         )
         self.actions += 1
+        self.at_boundary = False
         self._expected = (observation.life, observation.sequence + 1)
         return Action(
             robot=self._robot,
             actor_life=self.life,
             robot_life=observation.life,
             sequence=observation.sequence,
+            attempt=observation.attempt,
             action=action,
             greedy=greedy,
             values=(float(values[0]), float(values[1]), float(values[2])),
@@ -142,6 +147,7 @@ class Actor:
             "unreported": [self._unreported_samples, self._unreported_episodes],
             "actions_before": self._actions_before,
             "laps_before": list(self._laps_before),
+            "at_boundary": self.at_boundary,
             "expected": list(self._expected) if self._expected else None,
             "steps": [asdict(step) for step in self.open.steps],
         }
@@ -155,9 +161,12 @@ class Actor:
         self._actions_before = int(state["actions_before"])
         left, right = state["laps_before"]
         self._laps_before = (int(left), int(right))
+        self.at_boundary = bool(state["at_boundary"])
         expected = state["expected"]
         self._expected = (str(expected[0]), int(expected[1])) if expected else None
-        self.open = OpenEpisode(self._config.episode, tuple(Step(**step) for step in state["steps"]))
+        self.open = OpenEpisode(
+            self._config.episode, tuple(Step(**step) for step in state["steps"])
+        )
 
     def _ending(self, observation: Observation) -> Ending | None:
         """How this observation ends the open episode, if it does (A9, E6, E10, E11)."""
@@ -218,7 +227,9 @@ class Actor:
         )
 
 
-def _columns(steps: tuple[Step, ...], rewards: np.ndarray[Any, np.dtype[np.float32]]) -> dict[str, Any]:
+def _columns(
+    steps: tuple[Step, ...], rewards: np.ndarray[Any, np.dtype[np.float32]]
+) -> dict[str, Any]:
     """The per-sample fields of an `Episode`, as bytes."""
     worlds = tuple(dict.fromkeys(step.world for step in steps))
     places = [(step.x_m, step.y_m, step.heading_rad) for step in steps]

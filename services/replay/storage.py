@@ -333,9 +333,7 @@ class Storage:
             ids = [_number(key) for key in cursor.iternext(values=False)]
         return [i for i in ids if i < end and i not in dead]
 
-    def _rows(
-        self, txn: Txn, ids: list[int]
-    ) -> tuple[npt.NDArray[np.void], npt.NDArray[np.uint8]]:
+    def _rows(self, txn: Txn, ids: list[int]) -> tuple[npt.NDArray[np.void], npt.NDArray[np.uint8]]:
         keys = [_key(i) for i in ids]
         parts: dict[str, bytes] = {}
         for table in ("samples", "images"):
@@ -348,9 +346,7 @@ class Storage:
         images = np.frombuffer(parts["images"], np.uint8).reshape(len(ids), *IMAGE_SHAPE)
         return rows, images
 
-    def _stored_column(
-        self, txn: Txn, name: str, dtype: np.dtype[np.void]
-    ) -> npt.NDArray[np.void]:
+    def _stored_column(self, txn: Txn, name: str, dtype: np.dtype[np.void]) -> npt.NDArray[np.void]:
         return np.frombuffer(txn.get(name.encode(), db=self._db["columns"]) or b"", dtype)
 
     def _overlay_rewards(self, txn: Txn, rows: npt.NDArray[np.void]) -> None:

@@ -1,0 +1,289 @@
+"""The actor service: answers observations of all robots of the run, hands episodes to replay."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from services.actor.actor import Actor
+from shared import statefile
+from shared.bus import Inbox
+from shared.codec import decode, encode
+from shared.config import Config
+from shared.errors import StateError
+from shared.keys import ACTION, ACTOR_STATE, EPISODE, LEARNER_STATE, OBSERVATION, PROGRESS
+from shared.messages import (
+    Action,
+    ActorState,
+    Episode,
+    EpisodeAck,
+    LearnerState,
+    Observation,
+    ProgressRequest,
+    RobotProgress,
+)
+from shared.rl.predictor import Predictor
+from shared.service import TICK_S, Service, new_life, service
+from shared.weights import fetch
+
+
+def run(config: Config, folder: Path) -> None:
+    """Serve robots until stopped; a clean stop saves the open episodes."""
+    with service("actor", "main", config) as me:
+        loop = ActorLoop(me, folder / "actor")
+        try:
+            loop.run()
+        finally:
+            loop.save()
+
+
+@dataclass
+class Newest:
+    """What is known of the learner: its newest state, and the newest weights fetched."""
+
+    state: LearnerState | None = None
+    version: int = 0
+    data: bytes = b""
+
+
+class Session:
+    """One robot: its actor, and where the hand-over of its last episode stands."""
+
+    def __init__(self, me: Service, robot: str, path: Path, newest: Newest) -> None:
+        self._me, self._robot, self._path, self._newest = me, robot, path, newest
+        self._predictor = Predictor(me.config.network, me.config.numerics.actor)
+        self.actor = Actor(me.config, robot, new_life(), self._predictor)
+        self._pending: Episode | None = None
+        """Finished, not yet acknowledged."""
+        self._observation: Observation | None = None
+        """Waits for its action."""
+        self._answered: tuple[tuple[str, int, int], Action] | None = None
+        self.stale_observations = 0
+        self.resent_episodes = 0
+        self._counted = (time.monotonic(), 0)
+        saved = statefile.take(path)
+        if saved is not None:
+            self._restore(saved)
+
+    def offer(self, observation: Observation) -> None:
+        """Take an observation from the inbox: new, repeated, or outdated."""
+        place = (observation.life, observation.sequence, observation.attempt)
+        if self._answered is not None and self._answered[0] == place:
+            self._publish(self._answered[1])  # our answer was lost
+            return
+        if self._answered is not None and self._answered[0][0] == place[0]:
+            if place < self._answered[0]:
+                self.stale_observations += 1
+                return
+        if self._observation is None or place != self._place(self._observation):
+            self._observation = observation
+            if self.actor.progress is not None:
+                self._finish(observation)
+
+    def advance(self) -> None:
+        """Do what can be done now: hand over, wait for training, answer. Raises Stopped."""
+        if self._observation is None:
+            return
+        if self.actor.progress is None:
+            self._begin(self._observation)
+        if self._pending is not None:
+            self._hand_over(self._pending)
+        if self._may_act():
+            self._publish_answer(self._observation)
+        elif self._me.config.robot.timing == "realtime":
+            self._hold(self._observation)
+
+    def state(self) -> ActorState:
+        """The heartbeat."""
+        now_s, (then_s, count) = time.monotonic(), self._counted
+        rate = (self.actor.actions - count) / max(now_s - then_s, 1e-6)
+        self._counted = (now_s, self.actor.actions)
+        progress, action = self.actor.progress, self._answered[1] if self._answered else None
+        return ActorState(
+            id="main",
+            life=self.actor.life,
+            robot=self._robot,
+            phase=self._phase(progress),
+            step=len(self.actor.open),
+            robot_episode=progress.robot_episodes if progress else 0,
+            weights_version=self._predictor.version,
+            actions=self.actor.actions,
+            actions_per_s=rate,
+            stale_observations=self.stale_observations,
+            dropped_samples=self.actor.dropped_samples,
+            dropped_episodes=self.actor.dropped_episodes,
+            resent_episodes=self.resent_episodes,
+            undecodable=0,
+            values=action.values if action else (0.0, 0.0, 0.0),
+        )
+
+    def save(self) -> None:
+        """Save the open episode and what is not yet acknowledged."""
+        state = {"actor": self.actor.state(), "resent_episodes": self.resent_episodes}
+        if self._pending is not None:
+            state["pending"] = encode(self._pending)
+        if self._answered is not None:
+            state["answered"] = [list(self._answered[0]), encode(self._answered[1])]
+        statefile.save(self._path, state)
+
+    def _restore(self, saved: dict[str, object]) -> None:
+        try:
+            self.actor.restore(saved["actor"])  # type: ignore[arg-type]
+            self.resent_episodes = int(saved["resent_episodes"])  # type: ignore[call-overload]
+            if "pending" in saved:
+                self._pending = decode(saved["pending"], Episode)  # type: ignore[arg-type]
+            if "answered" in saved:
+                place, answer = saved["answered"]  # type: ignore[misc]
+                self._answered = (tuple(place), decode(answer, Action))
+        except Exception as error:
+            raise StateError(f"{self._path}: saved actor state does not fit: {error}") from error
+
+    def _begin(self, observation: Observation) -> None:
+        """Learn from replay where this robot was, and load weights."""
+        progress = self._me.insist("ask replay for the robot's progress", self._ask_progress)
+        if self._pending is None:
+            self.actor.begin(progress, observation)
+            self._finish(observation)
+        else:
+            self.actor.progress = progress
+
+    def _ask_progress(self) -> RobotProgress:
+        request = ProgressRequest(robot=self._robot)
+        return self._me.bus.request(PROGRESS, request, RobotProgress)
+
+    def _finish(self, observation: Observation) -> None:
+        """End the open episode if this observation does. It needs the weights of the episode."""
+        if len(self.actor.open) and self._predictor.version == 0:
+            self._load()
+        self._pending = self._pending or self.actor.finish(observation)
+
+    def _hand_over(self, episode: Episode) -> None:
+        """Send the episode until it is acknowledged: then it is on disk, exactly once."""
+        sent = 0
+
+        def attempt() -> EpisodeAck:
+            nonlocal sent
+            sent += 1
+            return self._me.bus.request(EPISODE, episode, EpisodeAck)
+
+        ack = self._me.insist("hand an episode to replay", attempt)
+        self.resent_episodes += sent - 1
+        if not ack.accepted or ack.progress is None:
+            raise StateError(f"replay refused episode {episode.number}: {ack.reason}")
+        self.actor.committed(ack.progress)
+        self._pending = None
+
+    def _may_act(self) -> bool:
+        """Whether the next action may be chosen now; loads the weights it needs (design 4)."""
+        progress, learner = self.actor.progress, self._newest.state
+        limit = self._me.config.run.episodes
+        if progress is None or learner is None:
+            return False
+        if limit and progress.episode >= limit and not progress.filling:
+            return False
+        synchronous = self._me.config.learning.mode == "synchronous"
+        if synchronous and learner.episode < progress.episode:
+            return False
+        if self.actor.at_boundary or self._predictor.version == 0:
+            self._load()
+        return True
+
+    def _load(self) -> None:
+        """Take up the newest target network. Raises Stopped."""
+        learner = self._newest.state
+        if learner is not None and learner.weights_version <= self._predictor.version:
+            return
+        if learner is None or self._newest.version < learner.weights_version:
+            fetched = self._me.insist("fetch weights", lambda: fetch(self._me.bus))
+            self._newest.version, self._newest.data = fetched
+        self._predictor.load(self._newest.version, self._newest.data)
+
+    def _publish_answer(self, observation: Observation) -> None:
+        action = self.actor.act(observation)
+        self._answered = (self._place(observation), action)
+        self._observation = None
+        self._publish(action)
+
+    def _hold(self, observation: Observation) -> None:
+        """Real time while the network trains: stand still for a period (design 3)."""
+        self._observation = None
+        self._publish(
+            Action(
+                robot=self._robot,
+                actor_life=self.actor.life,
+                robot_life=observation.life,
+                sequence=observation.sequence,
+                attempt=observation.attempt,
+                action=None,
+                greedy=False,
+                values=(0.0, 0.0, 0.0),
+                weights_version=self._predictor.version,
+            )
+        )
+
+    def _publish(self, action: Action) -> None:
+        self._me.bus.publish(ACTION, action, self._robot)
+
+    def _place(self, observation: Observation) -> tuple[str, int, int]:
+        return (observation.life, observation.sequence, observation.attempt)
+
+    def _phase(self, progress: RobotProgress | None) -> str:
+        if self._me.stop.is_set():
+            return "stopped"
+        if progress is None:
+            return "waiting"
+        if self._pending is not None:
+            return "handing-over"
+        learner = self._newest.state
+        if self._observation is not None and learner and learner.episode < progress.episode:
+            return "training"
+        return "filling" if progress.filling else "driving"
+
+
+class ActorLoop:
+    """One thread: observations in, actions and episodes out."""
+
+    def __init__(self, me: Service, folder: Path) -> None:
+        self._me, self._folder = me, folder
+        self._newest = Newest()
+        self._sessions: dict[str, Session] = {}
+        self._inbox: Inbox = me.bus.inbox()
+        self._inbox.subscribe(OBSERVATION)
+        self._inbox.subscribe(LEARNER_STATE, "main")
+        me.stop.on_set(self._inbox.wake)
+        self._next_beat_s = 0.0
+
+    def run(self) -> None:
+        """Serve until stopped."""
+        while not self._me.stop.is_set():
+            self._inbox.wait(TICK_S)
+            for _, state in self._inbox.take(LEARNER_STATE, LearnerState):
+                self._newest.state = state
+            for robot, observation in self._inbox.take(OBSERVATION, Observation):
+                self._session(robot).offer(observation)
+            for session in self._sessions.values():
+                session.advance()
+            self._beat()
+
+    def save(self) -> None:
+        """Save all robots' open episodes."""
+        for session in self._sessions.values():
+            session.save()
+
+    def _session(self, robot: str) -> Session:
+        if robot not in self._sessions:
+            path = self._folder / f"{robot}.msgpack"
+            self._sessions[robot] = Session(self._me, robot, path, self._newest)
+            self._me.log.info("serving robot %r", robot)
+        return self._sessions[robot]
+
+    def _beat(self) -> None:
+        now_s = time.monotonic()
+        if now_s < self._next_beat_s:
+            return
+        self._next_beat_s = now_s + self._me.config.bus.heartbeat_s
+        for robot, session in self._sessions.items():
+            state = session.state().model_copy(update={"undecodable": self._inbox.refused_total})
+            self._me.bus.publish(ACTOR_STATE, state, robot)
+

@@ -1,0 +1,99 @@
+"""The learner's copy of the memory, pulled change by change and exact at a known number."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from shared.bus import Bus
+from shared.errors import PeerSilent
+from shared.keys import CHANGES, SNAPSHOT
+from shared.messages import IMAGE_SHAPE, Change, ChangesRequest, FeedEnd, SnapshotRequest
+from shared.rl.memory import MIRROR, SampleStore
+
+TRANSFER_TIMEOUT_S = 60.0
+
+
+class Mirror:
+    """Samples as replay had them after change `number`; None before the first snapshot."""
+
+    def __init__(self) -> None:
+        self.samples = SampleStore()
+        self.number: int | None = None
+        self.resyncs = 0
+
+    def reach(self, bus: Bus, number: int) -> None:
+        """Bring the mirror to change `number` (beyond it only after a gap: then by snapshot).
+
+        Raises BusError; the mirror then stands at a complete change, or starts anew.
+        """
+        if self.number is not None and self.number >= number:
+            return
+        if self.number is not None:
+            request = ChangesRequest(since=self.number, upto=number)
+            parts, end = _received(
+                bus.request_many(CHANGES, request, Change, FeedEnd, timeout_s=TRANSFER_TIMEOUT_S)
+            )
+            if not end.gone and end.change == number:
+                for part in parts:
+                    self.apply(part)
+                self.number = number
+                return
+            self.resyncs += 1
+        self._snapshot(bus, number)
+
+    def apply(self, part: Change) -> None:
+        """Apply one part. Raises KeyError or ValueError when it does not fit the samples."""
+        apply(self.samples, part)
+
+    def _snapshot(self, bus: Bus, number: int) -> None:
+        self.samples, self.number = SampleStore(), None
+        replies = bus.request_many(
+            SNAPSHOT, SnapshotRequest(), Change, FeedEnd, timeout_s=TRANSFER_TIMEOUT_S
+        )
+        samples, rows, messages = SampleStore(), 0, 0
+        for part in replies:
+            if isinstance(part, FeedEnd):
+                _check_complete(part, rows, messages)
+                if part.change < number:
+                    raise PeerSilent(f"snapshot at change {part.change}, expected {number}")
+                self.samples, self.number = samples, part.change
+                return
+            apply(samples, part)
+            rows, messages = rows + len(part.ids) // 8, messages + 1
+        raise PeerSilent(f"snapshot broke off after {rows} rows")
+
+
+def apply(samples: SampleStore, part: Change) -> None:
+    """Apply one part of a change to a store of samples."""
+    ids = np.frombuffer(part.ids, "<u8")
+    if part.kind == "discard":
+        samples.remove(ids)
+        return
+    rewards = np.frombuffer(part.rewards, "<f4")
+    if part.kind == "rewards":
+        samples.set_rewards(ids, rewards)
+        return
+    rows = np.zeros(len(ids), MIRROR)
+    rows["id"], rows["reward"] = ids, rewards
+    rows["action"] = np.frombuffer(part.actions, np.uint8)
+    samples.append(rows, np.frombuffer(part.images, np.uint8).reshape(-1, *IMAGE_SHAPE))
+
+
+def _received(replies: Iterable[Change | FeedEnd]) -> tuple[list[Change], FeedEnd]:
+    parts: list[Change] = []
+    for reply in replies:
+        if isinstance(reply, FeedEnd):
+            _check_complete(reply, sum(len(p.ids) // 8 for p in parts), len(parts))
+            return parts, reply
+        parts.append(reply)
+    raise PeerSilent(f"changes broke off after {len(parts)} parts")
+
+
+def _check_complete(end: FeedEnd, rows: int, messages: int) -> None:
+    if (end.rows, end.messages) != (rows, messages):
+        raise PeerSilent(
+            f"transfer incomplete: expected {end.rows} rows in {end.messages} parts, "
+            f"got {rows} in {messages}"
+        )

@@ -1,0 +1,183 @@
+"""The replay service: three threads around one set of files.
+
+intake  commits episodes and answers short questions; owns the counters
+bulk    streams changes, snapshots and mini-batches from read transactions
+turns   owns the memory (`worker.TurnWorker`)
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+from services.replay.numbering import Counters, filling, progress_of
+from services.replay.storage import Storage
+from services.replay.worker import TurnWorker
+from shared.bus import Inbox, Request
+from shared.config import Config
+from shared.keys import (
+    CHANGES,
+    EPISODE,
+    MINI_BATCH,
+    PROGRESS,
+    REPLAY_STATE,
+    SNAPSHOT,
+    TURNS,
+)
+from shared.messages import (
+    ChangesRequest,
+    Episode,
+    EpisodeAck,
+    MiniBatchRequest,
+    ProgressRequest,
+    ReplayState,
+    SnapshotRequest,
+    Turns,
+    TurnsRequest,
+)
+from shared.rl.draws import generator
+from shared.service import TICK_S, Service, service
+
+
+def run(config: Config, folder: Path) -> None:
+    """Keep the replay memory until stopped."""
+    identity = f"{config.run.name}/{config.run.seed}"
+    storage = Storage(folder / "replay", config.memory, identity)
+    try:
+        with service("replay", "main", config) as me:
+            Intake(me, storage, folder).run()
+    finally:
+        storage.close()
+
+
+class Intake:
+    """The thread that commits episodes; starts and ends the other two."""
+
+    def __init__(self, me: Service, storage: Storage, folder: Path) -> None:
+        self._me, self._storage = me, storage
+        self._inbox: Inbox = me.bus.inbox()
+        self._bulk: Inbox = me.bus.inbox()
+        self._worker = TurnWorker(me, storage, folder, self._inbox.wake)
+        self._counters = storage.counters()
+        self.duplicates = 0
+        self.refused = 0
+        me.stop.on_set(self._inbox.wake)
+        me.stop.on_set(self._bulk.wake)
+
+    def run(self) -> None:
+        """Serve until stopped. Raises what ended the turn worker, if something did."""
+        for stream in (EPISODE, PROGRESS, TURNS):
+            self._inbox.serve(stream)
+        for stream in (CHANGES, SNAPSHOT, MINI_BATCH):
+            self._bulk.serve(stream)
+        bulk = threading.Thread(target=self._serve_bulk, name="bulk", daemon=True)
+        self._worker.start()
+        bulk.start()
+        try:
+            self._serve()
+        finally:
+            self._me.stop.set("finished")
+            self._worker.join(4.0)
+            bulk.join(4.0)
+        if self._worker.failure is not None and not self._stopping(self._worker.failure):
+            raise self._worker.failure
+
+    @staticmethod
+    def _stopping(failure: BaseException) -> bool:
+        return isinstance(failure, InterruptedError) or type(failure).__name__ == "Stopped"
+
+    def _serve(self) -> None:
+        next_beat_s, shown = 0.0, None
+        while not self._me.stop.is_set():
+            self._inbox.wait(TICK_S)
+            for request in self._inbox.requests():
+                with request:
+                    self._answer(request)
+            now_s, view = time.monotonic(), self._worker.view
+            if view.position != shown or now_s >= next_beat_s:
+                next_beat_s, shown = now_s + self._me.config.bus.heartbeat_s, view.position
+                self._me.bus.publish(REPLAY_STATE, self._state())
+
+    def _answer(self, request: Request) -> None:
+        message = request.message
+        if isinstance(message, Episode):
+            request.reply(self._commit(message))
+        elif isinstance(message, ProgressRequest):
+            request.reply(progress_of(self._counters, self._me.config.memory, message.robot))
+        elif isinstance(message, TurnsRequest):
+            request.reply(Turns(turns=self._storage.turns(message.since, message.limit)))
+
+    def _commit(self, episode: Episode) -> EpisodeAck:
+        """Store one submission; when the answer goes out, it is on disk."""
+        try:
+            accepted = self._storage.commit(episode)
+        except ValueError as error:
+            self.refused += 1
+            return EpisodeAck(accepted=False, reason=str(error))
+        self._counters = accepted.counters
+        self.duplicates += int(accepted.duplicate)
+        self._worker.submitted()
+        return EpisodeAck(
+            accepted=True,
+            duplicate=accepted.duplicate,
+            commit=accepted.commit.commit,
+            episode=accepted.commit.episode or self._counters.episode,
+            stored=accepted.commit.stored,
+            progress=progress_of(self._counters, self._me.config.memory, episode.robot),
+        )
+
+    def _state(self) -> ReplayState:
+        view, counters, memory = self._worker.view, self._counters, self._me.config.memory
+        return ReplayState(
+            id="main",
+            life=self._me.life,
+            change=view.position.change,
+            commit=counters.commit,
+            episode=counters.episode,
+            turn=view.position.turn,
+            turn_change=view.position.turn_change,
+            size=sum(view.by_action),
+            capacity=memory.capacity,
+            filling=filling(counters, memory),
+            by_action=view.by_action,
+            candidates_by_action=view.candidates,
+            threshold_bits=view.threshold_bits,
+            weights_version=view.weights_version,
+            activity=view.activity,
+            progress=view.progress,
+            fitness_mean_100=view.fitness_mean,
+            duplicates=self.duplicates,
+            refused=self.refused,
+            undecodable=self._inbox.refused_total + self._bulk.refused_total,
+            **_totals(counters),
+        )
+
+    def _serve_bulk(self) -> None:
+        while not self._me.stop.is_set():
+            self._bulk.wait(TICK_S)
+            for request in self._bulk.requests():
+                with request:
+                    self._stream(request)
+
+    def _stream(self, request: Request) -> None:
+        message = request.message
+        if isinstance(message, ChangesRequest):
+            for part in self._storage.changes(message.since, message.upto):
+                request.reply(part)
+        elif isinstance(message, SnapshotRequest):
+            for part in self._storage.snapshot():
+                request.reply(part)
+        elif isinstance(message, MiniBatchRequest):
+            size = self._storage.size()
+            if not size:
+                request.refuse("the memory is empty")
+                return
+            draw = generator(self._me.config.run.seed, "foreign mini-batch", message.key)
+            ranks = draw.choice(size, size=min(message.size, size), replace=False)
+            request.reply(self._storage.mini_batch(ranks))
+
+
+def _totals(counters: Counters) -> dict[str, int]:
+    names = "bumps laps_left laps_right actions dropped_samples dropped_episodes"
+    return {name: getattr(counters, name) for name in names.split()}

@@ -1,0 +1,220 @@
+"""The thread that owns the replay memory: one turn after the other, away from the serving threads.
+
+It reads committed episodes from disk, waits for the weights they need, appends, discards, equalises
+and applies the result in one transaction. Killed at any moment, it does the turn again.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from services.replay.numbering import Commit
+from services.replay.storage import Position, Storage
+from shared.bus import Inbox
+from shared.keys import LEARNER_STATE
+from shared.messages import LearnerState
+from shared.metrics import MetricsLog
+from shared.rl.descriptor import threshold_bits
+from shared.rl.memory import ReplayMemory
+from shared.rl.predictor import Predictor
+from shared.rl.turn import Maintenance, maintain
+from shared.service import TICK_S, Service
+from shared.weights import fetch
+
+Activity = Literal["idle", "committing", "descriptors", "equalising", "discarding", "waiting"]
+COLUMNS = (
+    "episode robot ended bump fitness fitness_mean_100 actions total_actions bumps laps_left "
+    "laps_right longest_run_actions samples memory discarded last_resort recomputed equalised "
+    "threshold_percent weights_version"
+)
+
+
+@dataclass(frozen=True)
+class View:
+    """What others may see of the memory: replaced as a whole, never changed."""
+
+    position: Position
+    by_action: tuple[int, int, int] = (0, 0, 0)
+    candidates: tuple[int, int, int] = (0, 0, 0)
+    weights_version: int = 0
+    activity: Activity = "idle"
+    progress: float = 1.0
+    fitness: tuple[int, ...] = field(default=())
+    """Of the last 100 counted episodes."""
+
+    @property
+    def threshold_bits(self) -> int:
+        """Similarity threshold of the next recomputation, in bits."""
+        return threshold_bits(self.position.threshold_percent)
+
+    @property
+    def fitness_mean(self) -> float:
+        """Mean fitness of the last 100 episodes (A37)."""
+        return float(np.mean(self.fitness)) if self.fitness else 0.0
+
+
+class TurnWorker(threading.Thread):
+    """Processes commits in order. `notify` is called whenever the view changes."""
+
+    def __init__(
+        self, me: Service, storage: Storage, folder: Path, notify: Callable[[], None]
+    ) -> None:
+        super().__init__(name="turns", daemon=True)
+        self._me, self._storage, self._notify = me, storage, notify
+        self._config = me.config.memory
+        self._wake = threading.Event()
+        self._predictor = Predictor(me.config.network, me.config.numerics.replay)
+        self._inbox: Inbox = me.bus.inbox()
+        self._inbox.subscribe(LEARNER_STATE, "main")
+        self._newest_version = 0
+        self._metrics = MetricsLog(folder, "episodes", tuple(COLUMNS.split()))
+        self._recent: deque[int] = deque(maxlen=100)
+        self.failure: BaseException | None = None
+        self.view = View(storage.position())
+        me.stop.on_set(self._wake.set)
+
+    def submitted(self) -> None:
+        """There is a new commit (any thread)."""
+        self._wake.set()
+
+    def run(self) -> None:
+        """Work until the service stops; a failure stops the service."""
+        try:
+            memory = self._load()
+            while not self._me.stop.is_set():
+                pending = self._storage.pending(self.view.position.processed)
+                if pending is None:
+                    self._wake.wait(TICK_S)
+                    self._wake.clear()
+                    continue
+                self._turn(memory, *pending)
+        except BaseException as error:
+            self.failure = error
+            self._me.stop.set(f"the turn worker ended: {error!r}")
+        finally:
+            self._metrics.close()
+
+    def _load(self) -> ReplayMemory:
+        memory = self._storage.load()
+        memory.check_valid()
+        self._restart_metrics()
+        self._show(memory, activity="idle")
+        return memory
+
+    def _turn(self, memory: ReplayMemory, commit: Commit, record: dict[str, Any]) -> None:
+        """Everything replay does about one submission (E25)."""
+        if commit.episode:
+            self._show(memory, activity="waiting")
+            self._await_weights(int(record["weights_version"]))
+        self._show(memory, activity="discarding")
+        rows, images = self._storage.rows_of(commit)
+        memory.append(rows, images)
+        done = maintain(
+            memory,
+            commit.episode,
+            self._config,
+            self.view.position.threshold_percent,
+            self._predictor,
+            describing=self._progress("descriptors"),
+            equalising=self._progress("equalising"),
+        )
+        position = self._storage.apply_turn(commit, record, memory, done)
+        if done.discarded.last_resort:
+            self._me.log.warning(
+                "episode %d: %d samples discarded by age, candidates ran out",
+                commit.episode,
+                done.discarded.last_resort,
+            )
+        if commit.episode:
+            self._recent.append(int(record["fitness"]))
+            self._metrics.write(self._row(commit, record, memory, done))
+        self._show(memory, position=position, activity="idle")
+
+    def _await_weights(self, least: int) -> None:
+        """Have the newest target network, of version `least` or later. Raises Stopped."""
+
+        def newest() -> None:
+            version, data = fetch(self._me.bus)
+            if version > self._predictor.version:
+                self._predictor.load(version, data)
+
+        for _, state in self._inbox.take(LEARNER_STATE, LearnerState):
+            self._newest_version = max(self._newest_version, state.weights_version)
+        while self._predictor.version < max(least, self._newest_version):
+            self._me.insist("fetch weights", newest)
+            if self._predictor.version < least and self._me.stop.wait(0.02):
+                break
+
+    def _progress(self, activity: Activity) -> Callable[[int, int], None]:
+        def report(done: int, of: int) -> None:
+            self.view = replace(self.view, activity=activity, progress=done / max(of, 1))
+            if self._me.stop.is_set():
+                raise InterruptedError("stopped during a pass over the memory")
+
+        return report
+
+    def _show(
+        self, memory: ReplayMemory, *, activity: Activity, position: Position | None = None
+    ) -> None:
+        by_action, candidates = memory.by_action(), memory.candidates_by_action()
+        self.view = View(
+            position or self.view.position,
+            (by_action[0], by_action[1], by_action[2]),
+            (candidates[0], candidates[1], candidates[2]),
+            self._predictor.version,
+            activity,
+            fitness=tuple(self._recent),
+        )
+        self._notify()
+
+    def _row(
+        self, commit: Commit, record: dict[str, Any], memory: ReplayMemory, done: Maintenance
+    ) -> dict[str, int | float | str]:
+        extra = {
+            "memory": len(memory),
+            "discarded": len(done.discarded.ids),
+            "last_resort": done.discarded.last_resort,
+            "recomputed": int(done.discarded.recomputed),
+            "equalised": int(done.equalised),
+            "threshold_percent": done.discarded.threshold_percent,
+        }
+        return {**self._basic_row(commit, record), **extra}
+
+    def _basic_row(self, commit: Commit, record: dict[str, Any]) -> dict[str, int | float | str]:
+        totals = record["totals"]
+        return {
+            "episode": commit.episode,
+            "robot": record["robot"],
+            "ended": record["ended"],
+            "bump": int(record["bump"]),
+            "fitness": record["fitness"],
+            "fitness_mean_100": round(float(np.mean(self._recent)), 2),
+            "actions": record["actions"],
+            "total_actions": totals["actions"],
+            "bumps": totals["bumps"],
+            "laps_left": totals["laps_left"],
+            "laps_right": totals["laps_right"],
+            "longest_run_actions": totals["longest_run_actions"],
+            "samples": commit.stored,
+            "weights_version": record["weights_version"],
+        }
+
+    def _restart_metrics(self) -> None:
+        """Make the CSV agree with what is on disk: rows of unprocessed episodes come again."""
+        processed = self.view.position.processed
+        written = {int(row["episode"]): row for row in self._metrics.kept(2**62)}
+        rows: list[dict[str, int | float | str]] = []
+        for record in self._storage.records(0):
+            commit = Commit(**record["commit"])
+            if commit.commit > processed:
+                break
+            self._recent.append(int(record["fitness"]))
+            rows.append({**written.get(commit.episode, {}), **self._basic_row(commit, record)})
+        self._metrics.restart(rows)

@@ -1,0 +1,217 @@
+"""The driver of one robot: observations out, actions in, safety always (no bus in here).
+
+The service and the single-process loop both use it. A robot only senses and moves (`robot.py`);
+sequence numbers, bumps, recovery and limits are decided here.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+from services.robot_driver.recovery import back_off
+from services.robot_driver.robot import STANDSTILL, Pose, Robot, Velocity
+from services.robot_driver.safety import Safety
+from shared.config import Config
+from shared.messages import Action, Interruption, Observation, RobotState
+from shared.rl.draws import generator
+from shared.rl.policy import FORWARD_LEFT, FORWARD_RIGHT
+
+State = Literal["waiting", "driving", "recovering", "paused", "estop", "stopped"]
+SLICE_S = 0.02
+"""Realtime: how often commands, bumper and deadman are looked at within a period."""
+
+
+def action_velocity(config: Config, action: int) -> Velocity:
+    """Body velocity of an action (A21): forward, turning for forward/left and forward/right."""
+    sense = {FORWARD_LEFT: 1.0, FORWARD_RIGHT: -1.0}.get(action, 0.0)
+    return Velocity(config.robot.speed_m_s, 0.0, sense * config.robot.turn_rad_s)
+
+
+class Driver:
+    """Executes actions one by one and tells what the robot perceives after each."""
+
+    def __init__(self, config: Config, robot: Robot, life: str) -> None:
+        self._config, self._robot = config, robot
+        self.life = life
+        self.safety = Safety(config.robot)
+        self.state: State = "waiting"
+        self.sequence = 0
+        self.attempt = 0
+        self.bumps = self.recoveries = self.late_actions = self.refused_actions = 0
+        self.resent_observations = 0
+        self._bump = False
+        self._interruption: Interruption = ""
+        self._moving = False
+        self._pose = Pose(0.0, 0.0, 0.0)
+
+    def observe(self) -> Observation:
+        """Sense now, as the observation that the next action answers. Raises RobotFault."""
+        sensed = self._robot.sense()
+        self._pose = sensed.pose
+        left, right = self._laps()
+        return Observation(
+            robot=self._config.robot.id,
+            life=self.life,
+            sequence=self.sequence,
+            attempt=self.attempt,
+            image=sensed.image.tobytes(),
+            x_m=sensed.pose.x_m,
+            y_m=sensed.pose.y_m,
+            heading_rad=sensed.pose.heading_rad,
+            bump=self._bump,
+            interruption=self._interruption,
+            world=self._config.robot.world,
+            period_s=self._config.robot.period_s,
+            stamp_s=self._robot.now_s(),
+            laps_left=left,
+            laps_right=right,
+        )
+
+    def answers(self, action: Action) -> bool:
+        """Whether this action answers the newest observation; any other is counted and ignored."""
+        fits = (action.robot_life, action.sequence, action.attempt) == (
+            self.life,
+            self.sequence,
+            self.attempt,
+        )
+        if not fits:
+            self.refused_actions += 1
+        return fits
+
+    def execute(self, action: int) -> None:
+        """Lockstep: drive one whole action; stop and recover at a bump (A9, E11)."""
+        self.start(action)
+        self.settle(self.advance(self._config.robot.period_s))
+
+    def start(self, action: int) -> None:
+        """Begin to drive an action, within the limits."""
+        self._drive(self.safety.allow(action_velocity(self._config, action), self._robot.now_s()))
+        self.state = "driving"
+
+    def advance(self, duration_s: float) -> bool:
+        """Let time pass; True at contact, where the robot has already stopped (unless `none`)."""
+        stop = self._config.robot.recovery != "none"
+        contact = self._robot.run(duration_s, stop_on_contact=stop)
+        if contact and stop:
+            self._drive(STANDSTILL)
+        self.enforce()
+        return contact
+
+    def enforce(self) -> None:
+        """Stop a robot whose last action is too old, or that is halted."""
+        if self._moving and self.safety.halted:
+            self._drive(STANDSTILL)
+        elif self._moving and self.safety.expired(self._robot.now_s()):
+            self.safety.count_deadman()
+            self._drive(STANDSTILL)
+
+    def settle(self, bump: bool, *, executed: bool = True) -> None:
+        """The action is over: count it, recover from a bump, look anew.
+
+        Realtime only: a bump before the newest observation was answered (not `executed`) belongs to
+        the action before it, so the number stays.
+        """
+        self._bump, self._interruption = bump, ""
+        self.bumps += int(bump)
+        if bump and self._config.robot.recovery == "back-off":
+            self._recover()
+        if executed:
+            self.sequence, self.attempt = self.sequence + 1, 0
+        else:
+            self.attempt += 1
+        self.state = "waiting"
+
+    def look_again(self, interruption: Interruption) -> None:
+        """The observation was not answered by motion: take a fresh one under the same number."""
+        self.attempt += 1
+        self._interruption = interruption or self._interruption
+        self.state = "waiting"
+
+    def halt(self) -> None:
+        """Stand still now; may be called in any state."""
+        self._drive(STANDSTILL)
+
+    def command(self, command: Literal["estop", "clear", "pause", "resume"]) -> None:
+        """Carry out an operator's command. A latched e-stop yields to `clear` alone."""
+        if command == "estop":
+            self.safety.estop = True
+        elif command == "clear":
+            if self.safety.estop:
+                self.look_again("estop")
+            self.safety.estop = False
+        else:
+            if command == "resume" and self.safety.paused and self._realtime:
+                self.look_again("pause")
+            self.safety.paused = command == "pause"
+        if self.safety.halted:
+            self.halt()
+
+    def report(self, undecodable: int) -> RobotState:
+        """The heartbeat."""
+        left, right = self._laps()
+        halted: State | None = (
+            "estop" if self.safety.estop else "paused" if self.safety.paused else None
+        )
+        return RobotState(
+            robot=self._config.robot.id,
+            life=self.life,
+            state=halted or self.state,
+            sequence=self.sequence,
+            x_m=self._pose.x_m,
+            y_m=self._pose.y_m,
+            heading_rad=self._pose.heading_rad,
+            world=self._config.robot.world,
+            bumps=self.bumps,
+            recoveries=self.recoveries,
+            deadman_stops=self.safety.deadman_stops,
+            clamped=self.safety.clamped,
+            late_actions=self.late_actions,
+            refused_actions=self.refused_actions,
+            resent_observations=self.resent_observations,
+            undecodable=undecodable,
+            laps_left=left,
+            laps_right=right,
+        )
+
+    def saved(self) -> dict[str, Any]:
+        """Everything a later process needs to continue exactly here, for msgpack."""
+        names = (
+            "life sequence attempt bumps recoveries late_actions refused_actions "
+            "resent_observations _bump _interruption"
+        )
+        return {
+            "robot": self._robot.state(),
+            "estop": self.safety.estop,
+            **{name: getattr(self, name) for name in names.split()},
+        }
+
+    def restore(self, saved: dict[str, Any]) -> None:
+        """Continue from `saved()`. Raises KeyError or ValueError when it does not fit."""
+        self._robot.restore(saved["robot"])
+        self.safety.estop = bool(saved["estop"])
+        for name, value in saved.items():
+            if name not in ("robot", "estop"):
+                setattr(self, name, type(getattr(self, name))(value))
+
+    @property
+    def _realtime(self) -> bool:
+        return self._config.robot.timing == "realtime"
+
+    def _laps(self) -> tuple[int, int]:
+        laps = getattr(self._robot, "laps", None)  # only worlds that know have them
+        return (laps.left, laps.right) if laps else (0, 0)
+
+    def _drive(self, velocity: Velocity) -> None:
+        self._robot.drive(velocity)
+        self._moving = velocity.moving
+
+    def _recover(self) -> None:
+        """Back off by real motion and turn to a random heading drawn from the seed (E11)."""
+        self.state = "recovering"
+        draw = generator(
+            self._config.run.seed, "recovery", self._config.robot.id, self.sequence
+        )
+        back_off(self._robot, self._config.robot, float(draw.uniform(-math.pi, math.pi)))
+        self._moving = False
+        self.recoveries += 1

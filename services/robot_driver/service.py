@@ -1,0 +1,193 @@
+"""The driver service: one robot on the bus, in lockstep or in real time."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from services.robot_driver.driver import SLICE_S, Driver
+from services.robot_driver.robot import Robot
+from shared import statefile
+from shared.bus import Inbox
+from shared.config import Config
+from shared.errors import ConfigError, StateError
+from shared.keys import ACTION, OBSERVATION, ROBOT_COMMAND, ROBOT_STATE
+from shared.messages import Action, Observation, RobotCommand
+from shared.service import TICK_S, Service, new_life, service
+
+if TYPE_CHECKING:
+    from services.robot_driver.sim import Laps, SimRobot
+
+
+def make_robot(config: Config) -> Robot:
+    """The robot of this configuration. Raises ConfigError for a world that cannot be used."""
+    from services.robot_driver.sim import SimRobot
+    from services.robot_driver.world import WorldError, load_world
+
+    try:
+        world = load_world(config.robot.world)
+        robot = SimRobot(config.robot, world, config.run.seed)
+    except (WorldError, ValueError) as error:
+        raise ConfigError(f"robot.world: {error}") from error
+    return PacedRobot(robot) if config.robot.timing == "realtime" else robot
+
+
+def run(config: Config, folder: Path) -> None:
+    """Drive one robot until stopped; a clean stop saves where it is."""
+    path = folder / "robot" / config.robot.id / "state.msgpack"
+    robot = make_robot(config)
+    driver = Driver(config, robot, new_life())
+    try:
+        saved = statefile.take(path)
+        if saved is not None:
+            _restore(driver, saved, path)
+        with service("driver", config.robot.id, config, life=driver.life) as me:
+            loop = DriverLoop(me, driver)
+            try:
+                loop.run()
+            finally:
+                driver.halt()
+                driver.state = "stopped"
+                loop.beat(force=True)
+            statefile.save(path, driver.saved())
+    finally:
+        driver.halt()
+        robot.close()
+
+
+def _restore(driver: Driver, saved: dict[str, object], path: Path) -> None:
+    try:
+        driver.restore(saved)
+    except (KeyError, TypeError, ValueError) as error:
+        raise StateError(f"{path}: saved state of the robot does not fit: {error}") from error
+
+
+class DriverLoop:
+    """Publishes observations and executes the actions that answer them."""
+
+    def __init__(self, me: Service, driver: Driver) -> None:
+        self._me, self._driver, self._config = me, driver, me.config
+        self._robot = me.config.robot.id
+        self._inbox: Inbox = me.bus.inbox()
+        self._inbox.subscribe(ACTION, self._robot)
+        self._inbox.serve(ROBOT_COMMAND, self._robot)
+        me.stop.on_set(self._inbox.wake)
+        self._next_beat_s = 0.0
+
+    def run(self) -> None:
+        """Turn after turn until the service is to stop."""
+        turn = self._lockstep_turn if self._config.robot.timing == "lockstep" else self._realtime_turn
+        while not self._me.stop.is_set():
+            turn()
+
+    def beat(self, *, force: bool = False) -> None:
+        """Answer commands; publish the heartbeat when due."""
+        for request in self._inbox.requests():
+            with request:
+                if isinstance(request.message, RobotCommand):
+                    self._driver.command(request.message.command)
+                    self._me.log.info("operator: %s", request.message.command)
+                    request.reply(self._driver.report(self._inbox.refused_total))
+                    force = True
+        now_s = time.monotonic()
+        if force or now_s >= self._next_beat_s:
+            self._next_beat_s = now_s + self._config.bus.heartbeat_s
+            report = self._driver.report(self._inbox.refused_total)
+            self._me.bus.publish(ROBOT_STATE, report, self._robot)
+
+    # ------------------------------------------------------------ lockstep
+
+    def _lockstep_turn(self) -> None:
+        """One observation, answered by one action; simulated time stands still meanwhile."""
+        observation = self._driver.observe()
+        action = self._await_answer(observation)
+        if action is None:
+            return
+        if action.action is None:
+            self._driver.look_again("")
+        else:
+            self._driver.execute(action.action)
+
+    def _await_answer(self, observation: Observation) -> Action | None:
+        """Publish, and publish again until answered. None when interrupted or stopped."""
+        driver, attempt = self._driver, observation.attempt
+        resend_s = 0.0
+        sent = 0
+        while not self._me.stop.is_set() and driver.attempt == attempt:
+            now_s = time.monotonic()
+            if not driver.safety.halted and now_s >= resend_s:
+                self._me.bus.publish(OBSERVATION, observation, self._robot)
+                driver.resent_observations += int(sent > 0)
+                sent, resend_s = sent + 1, now_s + self._config.robot.resend_s
+            self._inbox.wait(min(TICK_S, max(resend_s - now_s, 0.01)))
+            self.beat()
+            for _, action in self._inbox.take(ACTION, Action):
+                if driver.answers(action) and not driver.safety.halted:
+                    return action
+        return None
+
+    # ------------------------------------------------------------ real time
+
+    def _realtime_turn(self) -> None:
+        """One control period: the robot goes on as it does until the answer comes.
+
+        An answer counts until the period is over; without one the robot stops and the next
+        observation, of the same number, says so.
+        """
+        driver, period_s = self._driver, self._config.robot.period_s
+        self._me.bus.publish(OBSERVATION, driver.observe(), self._robot)
+        left_s, started, hold, bump = period_s, False, False, False
+        attempt = driver.attempt
+        while left_s > 1e-9 and not bump and not self._me.stop.is_set():
+            self.beat()
+            if driver.attempt != attempt or driver.safety.halted:
+                break
+            for _, action in self._inbox.take(ACTION, Action):
+                if started or hold or not driver.answers(action):
+                    continue
+                if action.action is None:
+                    hold = True
+                    driver.halt()
+                else:
+                    started = True
+                    driver.start(action.action)
+            part_s = min(SLICE_S, left_s)
+            bump = driver.advance(part_s)
+            left_s -= part_s
+        self._end_turn(attempt, started=started, hold=hold, bump=bump)
+
+    def _end_turn(self, attempt: int, *, started: bool, hold: bool, bump: bool) -> None:
+        driver = self._driver
+        if driver.safety.halted:
+            driver.halt()
+            self._inbox.wait(TICK_S)
+        elif started or bump:
+            driver.settle(bump, executed=started)
+        elif driver.attempt == attempt:
+            driver.halt()
+            driver.late_actions += int(not hold)
+            driver.look_again("" if hold else "late")
+
+
+class PacedRobot:
+    """A simulated robot whose time runs like the clock on the wall."""
+
+    def __init__(self, robot: SimRobot) -> None:
+        self._robot = robot
+        self._due_s = time.monotonic()
+        self.sense, self.drive = robot.sense, robot.drive
+        self.now_s, self.close = robot.now_s, robot.close
+        self.state, self.restore = robot.state, robot.restore
+
+    @property
+    def laps(self) -> Laps:
+        """As the simulated robot counts them."""
+        return self._robot.laps
+
+    def run(self, duration_s: float, *, stop_on_contact: bool) -> bool:
+        """Simulate, then wait until the wall clock has caught up."""
+        contact = self._robot.run(duration_s, stop_on_contact=stop_on_contact)
+        self._due_s = max(self._due_s, time.monotonic() - duration_s) + duration_s
+        time.sleep(max(0.0, self._due_s - time.monotonic()))
+        return contact

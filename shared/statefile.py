@@ -1,0 +1,55 @@
+"""Small state saved by a clean stop and taken up once by the next start."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import msgpack
+
+from shared.errors import StateError
+
+LIMIT_BYTES = 64 * 1024 * 1024
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a file so that after a kill or power cut it is either the old or the new one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(path.name + ".new")
+    with beside.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    beside.replace(path)
+    directory = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(directory)
+    finally:
+        os.close(directory)
+
+
+def save(path: Path, state: dict[str, Any]) -> None:
+    """Save plain values."""
+    write_atomically(path, msgpack.packb(state))
+
+
+def take(path: Path) -> dict[str, Any] | None:
+    """Read saved values and remove the file: whoever is killed later must not come back to them.
+
+    Returns None when there is no file. Raises StateError when it is damaged.
+    """
+    try:
+        if path.stat().st_size > LIMIT_BYTES:
+            raise StateError(f"{path}: expected at most {LIMIT_BYTES} bytes of saved state")
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    path.unlink()
+    try:
+        state = msgpack.unpackb(data)
+    except (ValueError, msgpack.UnpackException) as error:
+        raise StateError(f"{path}: damaged saved state: {error}") from error
+    if not isinstance(state, dict):
+        raise StateError(f"{path}: damaged saved state: not a map")
+    return state
