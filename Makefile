@@ -1,0 +1,78 @@
+# Everything from one virtual environment made here; needs python3.11 and make, nothing else.
+#
+#   make demo       install, then watch a simulated robot learn; Ctrl-C stops, again continues
+#   make test       install, then all checks and tests but the slow ones
+#
+# Variables: PYTHON (python3.11), ARGS (more options for `corridor up` in demo), and
+# TORCH_INDEX_URL: one of PyTorch's own package indexes, to choose a CPU-only or a CUDA build.
+
+PYTHON ?= python3.11
+TORCH_INDEX_URL ?=
+ARGS ?=
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+# Tests run beside each other: more than one thread each would only get in the way.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-full check lint unit system clean
+.DELETE_ON_ERROR:
+
+help: ## show this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+setup: $(VENV)/.dev ## make the virtual environment with everything in it
+
+demo: $(VENV)/.all ## install what is needed, then run the demo until Ctrl-C
+	@$(BIN)/corridor up --preset demo $(ARGS)
+
+test: check unit system ## all checks and tests but the slow ones
+
+test-full: check ## all checks and tests
+	$(PYTEST) -n 2 tests/unit tests/contract
+	$(PYTEST) tests/system tests/learning
+
+check: lint ## style, types, dependency rules
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+lint: $(VENV)/.dev ## style only
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+unit: $(VENV)/.dev ## fast tests, two at a time
+	$(PYTEST) -n 2 -m "not slow" tests/unit tests/contract
+
+# Real processes wait for each other: one test at a time.
+system: $(VENV)/.dev ## tests with real processes and a real router, without the slow ones
+	$(PYTEST) -m "not slow" tests/system tests/learning
+
+clean: ## remove the virtual environment and all caches; runs stay
+	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	find shared services experiments benchmarks tests -name __pycache__ -prune -exec rm -rf {} +
+
+# ---------------------------------------------------------------- the virtual environment
+
+$(VENV)/.dev: $(VENV)/.all
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[all,dev]'
+	@touch $@
+
+$(VENV)/.all: pyproject.toml constraints.txt $(VENV)/.made
+	@echo "installing into $(VENV), this takes a few minutes the first time"
+ifneq ($(strip $(TORCH_INDEX_URL)),)
+	$(PIP) install --quiet --constraint constraints.txt --no-deps --index-url '$(TORCH_INDEX_URL)' torch
+endif
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[all]'
+	@touch $@
+
+$(VENV)/.made:
+	@command -v $(PYTHON) >/dev/null 2>&1 || \
+	  { echo "missing: $(PYTHON); install Python 3.11 or say where it is: make PYTHON=/path/to/python3.11" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || \
+	  { echo "wrong version: $(PYTHON) is $$($(PYTHON) -V 2>&1), expected Python 3.11" >&2; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || \
+	  { echo "missing: the venv and ensurepip modules of $(PYTHON); on Debian install python3.11-venv" >&2; exit 1; }
+	@$(PYTHON) -m venv --clear $(VENV)
+	@$(PIP) --version >/dev/null || { echo "missing: pip in $(VENV)" >&2; exit 1; }
+	@touch $@
