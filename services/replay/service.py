@@ -37,7 +37,7 @@ from shared.messages import (
     TurnsRequest,
 )
 from shared.rl.draws import generator
-from shared.service import TICK_S, Service, service
+from shared.service import TICK_S, Service, Stopped, service
 
 
 def run(config: Config, folder: Path) -> None:
@@ -80,12 +80,8 @@ class Intake:
             self._me.stop.set("finished")
             self._worker.join(4.0)
             bulk.join(4.0)
-        if self._worker.failure is not None and not self._stopping(self._worker.failure):
+        if self._worker.failure is not None and not isinstance(self._worker.failure, Stopped):
             raise self._worker.failure
-
-    @staticmethod
-    def _stopping(failure: BaseException) -> bool:
-        return isinstance(failure, InterruptedError) or type(failure).__name__ == "Stopped"
 
     def _serve(self) -> None:
         next_beat_s, shown = 0.0, None

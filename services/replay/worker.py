@@ -25,7 +25,7 @@ from shared.rl.descriptor import threshold_bits
 from shared.rl.memory import ReplayMemory
 from shared.rl.predictor import Predictor
 from shared.rl.turn import Maintenance, maintain
-from shared.service import TICK_S, Service
+from shared.service import TICK_S, Service, Stopped
 from shared.weights import fetch
 
 Activity = Literal["idle", "committing", "descriptors", "equalising", "discarding", "waiting"]
@@ -125,6 +125,9 @@ class TurnWorker(threading.Thread):
             describing=self._progress("descriptors"),
             equalising=self._progress("equalising"),
         )
+        if commit.episode:  # written first: a row without its turn is dropped at the next start
+            self._recent.append(int(record["fitness"]))
+            self._metrics.write(self._row(commit, record, memory, done))
         position = self._storage.apply_turn(commit, record, memory, done)
         if done.discarded.last_resort:
             self._me.log.warning(
@@ -132,9 +135,6 @@ class TurnWorker(threading.Thread):
                 commit.episode,
                 done.discarded.last_resort,
             )
-        if commit.episode:
-            self._recent.append(int(record["fitness"]))
-            self._metrics.write(self._row(commit, record, memory, done))
         self._show(memory, position=position, activity="idle")
 
     def _await_weights(self, least: int) -> None:
@@ -150,13 +150,13 @@ class TurnWorker(threading.Thread):
         while self._predictor.version < max(least, self._newest_version):
             self._me.insist("fetch weights", newest)
             if self._predictor.version < least and self._me.stop.wait(0.02):
-                break
+                raise Stopped("waiting for weights")
 
     def _progress(self, activity: Activity) -> Callable[[int, int], None]:
         def report(done: int, of: int) -> None:
             self.view = replace(self.view, activity=activity, progress=done / max(of, 1))
             if self._me.stop.is_set():
-                raise InterruptedError("stopped during a pass over the memory")
+                raise Stopped("a pass over the memory")
 
         return report
 

@@ -51,7 +51,7 @@ def choose(values: Values, config: PolicyConfig, rng: np.random.Generator) -> tu
     first the branch (greedy if u >= epsilon), then the action.
     """
     branch, draw = rng.random(2)
-    greedy = config.kind != "roulette" and branch >= config.epsilon
+    greedy = config.kind != "roulette" and bool(branch >= config.epsilon)
     chances = greedy_distribution(values) if greedy else exploring_distribution(values, config)
     return _pick(chances, float(draw)), greedy
 

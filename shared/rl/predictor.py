@@ -37,7 +37,7 @@ def arithmetic(numerics: Numerics) -> Iterator[None]:
 
 def network_input(images: Images, device: str) -> Tensor:
     """uint8 [n, 50, 75] to float32 [n, 1, 50, 75] in [0, 1] (A22)."""
-    tensor = torch.from_numpy(np.ascontiguousarray(images)).to(device)
+    tensor = torch.from_numpy(np.array(images)).to(device)  # received images are read-only
     return tensor.unsqueeze(1).to(torch.float32).div_(255.0)
 
 

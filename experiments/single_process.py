@@ -1,0 +1,99 @@
+"""The whole system in one process: the parts wired by function calls, no bus, no disk, no threads.
+
+Read this first: it is the algorithm of Fig 3.2 in the order of E25, made of exactly the parts the
+services are made of. The distributed system in lockstep with synchronous learning computes the same
+actions, rewards, memory, marks and weights, bit for bit; tests/system compares the two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from services.actor.actor import Actor
+from services.replay import numbering
+from services.replay.numbering import Commit, Counters
+from services.robot_driver.driver import Driver
+from services.robot_driver.robot import Robot
+from shared.config import Config
+from shared.messages import Episode
+from shared.rl.learning import Trained, Trainer
+from shared.rl.memory import ReplayMemory
+from shared.rl.network import to_bytes
+from shared.rl.predictor import Predictor
+from shared.rl.turn import Maintenance, maintain, sample_rows
+
+LIFE = "0" * 12
+"""Life ids are random in the services; comparison ignores them."""
+
+
+@dataclass(frozen=True)
+class TurnDone:
+    """One submission went all the way round."""
+
+    commit: Commit
+    submitted: Episode
+    maintenance: Maintenance
+    trained: tuple[Trained, ...]
+    target_changed: bool
+
+
+class SingleProcess:
+    """Driver, actor, replay and learner of one robot as plain objects."""
+
+    def __init__(self, config: Config, robot: Robot) -> None:
+        self.config = config
+        self.driver = Driver(config, robot, LIFE)
+        self.acting = Predictor(config.network, config.numerics.actor)
+        self.actor = Actor(config, config.robot.id, LIFE, self.acting)
+        self.memory = ReplayMemory(config.memory.capacity)
+        self.counters = Counters()
+        self.threshold_percent = config.memory.threshold_percent
+        self.judging = Predictor(config.network, config.numerics.replay)
+        self.trainer = Trainer(
+            config.network, config.learning, config.numerics.learner, config.run.seed
+        )
+        self._publish()
+
+    def run(self) -> Iterator[TurnDone]:
+        """Drive and learn for ever; yields after every submission, fill ones included."""
+        config, robot = self.config, self.config.robot.id
+        observation = self.driver.observe()
+        self.actor.begin(numbering.progress_of(self.counters, config.memory, robot), observation)
+        while True:
+            submission = self.actor.finish(observation)
+            if submission is not None:
+                done = self._turn(submission)
+                progress = numbering.progress_of(self.counters, config.memory, robot)
+                self.actor.committed(progress)
+                yield done
+            action = self.actor.act(observation)
+            assert action.action is not None
+            self.driver.execute(action.action)
+            observation = self.driver.observe()
+
+    def _turn(self, episode: Episode) -> TurnDone:
+        """append -> discard -> equalise -> train or fit -> target rule -> publish (E25)."""
+        config = self.config
+        commit, self.counters = numbering.accept(self.counters, config.memory, episode)
+        rows, images = sample_rows(
+            self.memory, episode, commit.first_id, commit.commit, commit.episode
+        )
+        self.memory.append(rows[: commit.stored], images[: commit.stored])
+        maintenance = maintain(
+            self.memory, commit.episode, config.memory, self.threshold_percent, self.judging
+        )
+        self.threshold_percent = maintenance.discarded.threshold_percent
+        if not commit.episode:  # the memory is being filled: not an episode, no training (E9)
+            return TurnDone(commit, episode, maintenance, (), False)
+        trained = tuple(self.trainer.learn(self.memory, commit.episode))
+        changed = self.trainer.apply_target_rule(commit.episode, episode.bump)
+        if changed:
+            self._publish()
+        return TurnDone(commit, episode, maintenance, trained, changed)
+
+    def _publish(self) -> None:
+        """Acting, rewards, descriptors and equalisation all use the newest target (A26, E14)."""
+        data = to_bytes(self.trainer.target_network)
+        for predictor in (self.acting, self.judging):
+            predictor.load(self.trainer.version, data)
