@@ -266,7 +266,7 @@ def world_render(
     out: Annotated[Path, typer.Option(help="Folder for the PNG files.")] = Path("renders"),
 ) -> None:
     """Write a top view and camera views of a world as PNG files."""
-    survey = _import("services.robot_driver.survey", "robot_driver")
+    survey = import_role("services.robot_driver.survey", "robot_driver")
     survey.render(name, out)
     typer.echo(f"written to {out}")
 
@@ -280,7 +280,7 @@ def world_check(
 ) -> None:
     """Measure a world: lap length, corridor width, turning circle, how many poses can be saved."""
     loaded = _load(preset, config, set_, others={"robot.world": name})
-    survey = _import("services.robot_driver.survey", "robot_driver")
+    survey = import_role("services.robot_driver.survey", "robot_driver")
     for key, value in survey.survey(loaded).items():
         typer.echo(f"{key:40} {value:.3f}" if isinstance(value, float) else f"{key:40} {value}")
 
@@ -326,12 +326,12 @@ def _serve(package: str, config: Config, folder: Path, tethered: bool) -> int:
     setup_logging(package, folder)
 
     def run() -> None:
-        _import(f"services.{package}.service", package).run(config, folder)
+        import_role(f"services.{package}.service", package).run(config, folder)
 
     return guarded(package, run)
 
 
-def _import(module: str, role: str) -> Any:
+def import_role(module: str, role: str) -> Any:
     """A module of ours. Raises ConfigError when a library of this role is not installed."""
     try:
         return importlib.import_module(module)

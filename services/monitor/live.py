@@ -19,6 +19,8 @@ ACTIONS = ("forward", "left", "right")
 DESCRIPTOR_BITS = 120
 """Length of a descriptor, of which the threshold is a part (A29)."""
 BAR_WIDTH = 30
+RECENT_S = 60.0
+"""A crash longer ago is mentioned, but no longer explained."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,8 @@ def _child_warnings(view: View) -> Iterator[str]:
             yield f"{child.name} has stopped"
         elif child.restarts:
             times = "once" if child.restarts == 1 else f"{child.restarts} times"
-            yield f"{child.name} was restarted {times}, last after {child.note}"
+            why = f", last after {child.note}" if child.up_s < RECENT_S else ""
+            yield f"{child.name} was restarted {times}{why}"
 
 
 def _silences(view: View) -> Iterator[str]:

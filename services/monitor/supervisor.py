@@ -30,6 +30,8 @@ FIRST_DELAY_S, LONGEST_DELAY_S = 0.25, 10.0
 STEADY_S = 30.0
 """A child that ran this long is restarted at once when it crashes."""
 FINAL_CODES = (2, 3)
+TAIL_BYTES = 16 * 1024
+"""As much of the output of an ended child is looked at."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,9 @@ class ChildStatus:
     state: Literal["running", "restarting", "stopped"]
     restarts: int
     note: str
-    """Last line of output of the newest crash; empty without one."""
+    """How the newest crash ended; empty without one."""
+    up_s: float = 0.0
+    """How long the process has run."""
 
 
 @dataclass(frozen=True)
@@ -203,15 +207,15 @@ class _Child:
         state: Literal["running", "restarting", "stopped"] = (
             "stopped" if self.finished else "restarting" if self.process is None else "running"
         )
-        return ChildStatus(self.spec.name, state, max(0, self._starts - 1), self._note)
+        up_s = time.monotonic() - self._started_s if state == "running" else 0.0
+        return ChildStatus(self.spec.name, state, max(0, self._starts - 1), self._note, up_s)
 
     def last_line(self) -> str:
-        """The last line of output since the start, without the time and name of the logger."""
+        """What the process last said about its end, since it was started."""
         with self._output.open("rb") as stream:
             stream.seek(0, os.SEEK_END)
-            stream.seek(max(self._offset, stream.tell() - 4096))
-            lines = stream.read().decode(errors="replace").strip().splitlines()
-        return re.sub(r"^\S+ \S+ \S+ (ERROR|WARNING|INFO) ", "", lines[-1]) if lines else ""
+            stream.seek(max(self._offset, stream.tell() - TAIL_BYTES))
+            return verdict(stream.read().decode(errors="replace"))
 
     def terminate(self) -> None:
         if self.process is not None and self.is_alive():
@@ -232,3 +236,19 @@ class _Child:
         if stdin is not None:
             stdin.close()
         self.process = None
+
+
+def verdict(output: str) -> str:
+    """The one line of a process's output that says best why it ended.
+
+    The exception of a traceback, whose text may go on for more lines, else the last line; without
+    the time and name that the logger puts in front.
+    """
+    lines = output.strip().splitlines() or [""]
+    traceback = max(
+        (i for i, text in enumerate(lines) if text.startswith("Traceback ")), default=None
+    )
+    raised = lines if traceback is None else lines[traceback + 1 :]
+    exceptions = [text for text in raised if re.match(r"[A-Za-z_][\w.]*(:|$)", text)]
+    chosen = exceptions[0] if traceback is not None and exceptions else lines[-1]
+    return re.sub(r"^(\S+ \S+ \S+ (ERROR|WARNING|INFO) |corridor: )", "", chosen.strip())

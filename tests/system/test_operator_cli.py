@@ -1,0 +1,162 @@
+"""Status, stop and the commands to robots, against stand-ins for services and a real router."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+import pytest
+from fakes import answering, fake_service, message
+from waiting import wait_until
+
+from services import cli
+from shared.bus import Bus
+from shared.config import Config
+from shared.keys import LEARNER_STATE, REPLAY_STATE, ROBOT_COMMAND
+from shared.messages import (
+    LearnerState,
+    Message,
+    ReplayState,
+    RobotCommand,
+    RobotState,
+    ServiceCommand,
+)
+from shared.settings import load
+
+pytestmark = pytest.mark.system
+
+
+@pytest.fixture
+def config(router: str, run_name: str) -> Config:
+    return load(overrides=[f"bus.endpoint={router}", f"run.name={run_name}"])
+
+
+@pytest.fixture
+def options(config: Config) -> list[str]:
+    return ["--run", config.run.name, "--endpoint", config.bus.endpoint]
+
+
+@pytest.fixture
+def watching(config: Config) -> Iterator[Bus]:
+    with Bus(config.bus, config.run.name) as bus:
+        yield bus
+
+
+def wait_for_peers(bus: Bus, count: int) -> None:
+    wait_until(lambda: len(bus.peers()) == count, 10, f"{count} services to be visible")
+
+
+def test_status_lists_services_and_what_they_tell(
+    config: Config, options: list[str], watching: Bus, capsys: pytest.CaptureFixture[str]
+) -> None:
+    replay = message(ReplayState, episode=12, size=300, capacity=400, by_action=(100, 90, 110))
+    learner = message(LearnerState, episode=11, weights_version=7)
+    done = threading.Event()
+
+    def beat(bus: Bus) -> None:
+        while not done.wait(0.1):
+            bus.publish(REPLAY_STATE, replay)
+            bus.publish(LEARNER_STATE, learner)
+
+    with (
+        fake_service(config, "replay", "main", []) as bus,
+        fake_service(config, "learner", "main", []),
+    ):
+        wait_for_peers(watching, 2)
+        thread = threading.Thread(target=beat, args=(bus,))
+        thread.start()
+        try:
+            assert cli.main(["status", *options, "--require", "replay"]) == 0
+            table = capsys.readouterr().out
+            assert cli.main(["status", *options, "--json", "--require", "actor"]) == 1
+            output = capsys.readouterr()
+        finally:
+            done.set()
+            thread.join()
+    for part in ("replay", "learner", "main", "1234", "0:01:01", "300 of 400", "forward 100"):
+        assert part in table
+    assert output.err == "corridor: no answer from actor\n"
+    told = json.loads(output.out)
+    assert [(s["service"], s["answers"]) for s in told["services"]] == [
+        ("learner", True),
+        ("replay", True),
+    ]
+    assert told["replay"]["episode"] == 12
+    assert told["learner"]["weights_version"] == 7
+    assert told["robots"] == {}
+
+
+def test_status_of_nobody(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["status", *options]) == 0
+    assert "no service is alive" in capsys.readouterr().out
+
+
+def test_status_shows_who_is_there_but_silent(
+    config: Config, options: list[str], watching: Bus, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Bus(config.bus, config.run.name) as mute:
+        mute.announce("actor", "main", "0" * 12, 1, config.fingerprint())
+        wait_for_peers(watching, 1)
+        assert cli.main(["status", *options, "--require", "actor"]) == 1
+    assert "no answer" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["estop", "clear", "pause", "resume"])
+def test_commands_reach_all_robots_and_print_what_they_acknowledge(
+    command: str,
+    config: Config,
+    options: list[str],
+    watching: Bus,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    state = {"estop": "estop", "clear": "waiting", "pause": "paused", "resume": "driving"}[command]
+    heard: list[Message] = []
+
+    def answer(request: Message) -> RobotState:
+        heard.append(request)
+        return message(RobotState, state=state)
+
+    with ExitStack() as stack:
+        for robot in ("r1", "r2"):
+            stack.enter_context(fake_service(config, "robot_driver", robot, []))
+            stack.enter_context(
+                answering(config.bus, config.run.name, ROBOT_COMMAND, robot, answer)
+            )
+        wait_for_peers(watching, 2)
+        assert cli.main([command, *options]) == 0
+        assert capsys.readouterr().out == f"r1: {state}\nr2: {state}\n"
+        assert cli.main([command, *options, "--robot", "r2"]) == 0
+        assert capsys.readouterr().out == f"r2: {state}\n"
+    assert heard == [RobotCommand(command=command)] * 3
+
+
+def test_a_command_that_nobody_hears_fails_in_one_line(
+    options: list[str], config: Config, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["estop", *options]) == 1
+    assert capsys.readouterr().err == (
+        f"corridor: no robot of run '{config.run.name}' answers at {config.bus.endpoint}\n"
+    )
+    assert cli.main(["estop", *options, "--robot", "r9"]) == 1
+    assert capsys.readouterr().err.startswith("r9: no answer to 'estop'")
+
+
+def test_stop_reaches_chosen_services_and_tells_who_stays(
+    config: Config,
+    options: list[str],
+    watching: Bus,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("services.monitor.operator.GONE_WITHIN_S", 0.5)
+    commands: list[Message] = []
+    with fake_service(config, "replay", "main", commands):
+        wait_for_peers(watching, 1)
+        assert cli.main(["stop", *options, "--service", "actor"]) == 1
+        assert "no actor of run" in capsys.readouterr().err
+        assert commands == []
+        assert cli.main(["stop", *options]) == 1
+        assert capsys.readouterr().out == "replay main: still there\n"
+        assert commands == [ServiceCommand(command="stop")]
