@@ -31,6 +31,8 @@ CONTACT_M = 0.001
 _EXACT_STEP_M = 0.01
 _TABLE_STEPS = 5
 """Points at which the tables look at the way of one action."""
+_DISCOUNT = 0.99
+_LAP_SWEEPS = 250
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,15 @@ class Run:
     """[steps + 1, n, 3]; the last one stays when the run ended."""
 
 
+@dataclass(frozen=True)
+class _Lap:
+    """What a racing run follows."""
+
+    direction: int
+    keep_m: float
+    table: Table
+
+
 class Planner:
     """Tables for one world and one motion.
 
@@ -99,8 +110,8 @@ class Planner:
         world: World,
         motion: Motion,
         *,
-        cell_m: float = 0.04,
-        headings: int = 72,
+        cell_m: float = 0.05,
+        headings: int = 48,
         horizon: int = 500,
     ) -> None:
         self.world = world
@@ -118,23 +129,25 @@ class Planner:
         self._margin = self._margin_table(horizon)
 
     def drive(self, poses: Floats, actions: int) -> Run:
-        """Planned runs that keep most room, from float64 [n, 3]; their end is proven lost only by
-        the tables, their survival by exact motion.
-        """
-        return self._roll_out(poses, actions, None, 0)
+        """Planned runs that keep most room, from poses float64 [n, 3]."""
+        return self._roll_out(poses, actions, None)
 
-    def race(self, pose: Floats, actions: int, direction: int) -> Run:
+    def race(self, pose: Floats, actions: int, direction: int, keep_m: float = 0.005) -> Run:
         """The planned run from one pose [3] with most net angle round the lap centre.
+
+        Where the room to keep cannot be kept, it makes for more room first.
 
         Args:
             pose: x, y, heading.
             actions: Length of the run.
             direction: 1 anticlockwise, -1 clockwise.
+            keep_m: Room to keep to all walls.
 
         Raises:
             ValueError: The world has no lap centre.
         """
-        return self._roll_out(pose[None, :], actions, self._lap_table(direction), direction)
+        lap = _Lap(direction, keep_m, self._lap_table(direction, keep_m))
+        return self._roll_out(pose[None, :], actions, lap)
 
     def winding(self, poses: Floats) -> Floats:
         """Net angle round the lap centre along float64 [steps, 3], radians, float64 [steps].
@@ -145,14 +158,14 @@ class Planner:
         angle = np.unwrap(self._bearing(poses))
         return np.asarray(angle - angle[0])
 
-    def _roll_out(self, poses: Floats, actions: int, table: Table | None, direction: int) -> Run:
+    def _roll_out(self, poses: Floats, actions: int, lap: _Lap | None) -> Run:
         poses = poses.copy()
         survived = np.zeros(len(poses), np.int64)
         alive = np.arange(len(poses))
         chosen_all, poses_all = [], [poses.copy()]
         for _ in range(actions):
             chosen = np.zeros(len(poses), np.int64)
-            chosen[alive] = self._choose(poses[alive], table, direction)
+            chosen[alive] = self._choose(poses[alive], lap)
             safe = np.zeros(len(poses), np.bool_)
             for action in range(3):
                 mine = alive[chosen[alive] == action]
@@ -166,7 +179,7 @@ class Planner:
                 break
         return Run(survived, np.array(chosen_all, np.int64), np.array(poses_all))
 
-    def _choose(self, poses: Floats, table: Table | None, direction: int) -> Ints:
+    def _choose(self, poses: Floats, lap: _Lap | None) -> Ints:
         """The action with most room on its way and after it, or with most progress if safe."""
         scores = []
         for action in range(3):
@@ -174,12 +187,12 @@ class Planner:
             room = np.minimum(
                 self._look_up(self._way[action], poses), self._look_up(self._margin, after)
             )
-            if table is not None:
-                gain = direction * _wrap(self._bearing(after) - self._bearing(poses))
-                value = gain + _DISCOUNT * self._look_up(table, after)
-                room = np.where(room > _SAFE_M, value, room - 100.0)
+            if lap is not None:
+                gain = lap.direction * _wrap(self._bearing(after) - self._bearing(poses))
+                value = gain + _DISCOUNT * self._look_up(lap.table, after)
+                room = np.where(room > lap.keep_m, value, room - 100.0)
             scores.append(room)
-        return np.argmax(np.stack(scores), axis=0)
+        return np.asarray(np.argmax(np.stack(scores), axis=0), np.int64)
 
     def _margin_table(self, horizon: int) -> Table:
         """Room kept at the narrowest place of the best run of `horizon` actions."""
@@ -192,7 +205,7 @@ class Planner:
             table = new
         return table
 
-    def _lap_table(self, direction: int) -> Table:
+    def _lap_table(self, direction: int, keep_m: float) -> Table:
         """Discounted net angle round the lap centre of the best safe run, radians."""
         before = np.column_stack([self._points, np.zeros(len(self._points))])
         gains = []
@@ -203,7 +216,7 @@ class Planner:
                 turned = self._bearing(self.motion.move(before, action)) - self._bearing(before)
                 gain[h] = (direction * _wrap(turned)).reshape(self._room.shape)
             room = np.minimum(self._way[action], self._after(self._margin, action, -1.0))
-            gains.append(np.where(room > _SAFE_M, gain, np.float32(-1.0)))
+            gains.append(np.where(room > keep_m, gain, np.float32(-1.0)))
         table = np.zeros_like(self._margin)
         for _ in range(_LAP_SWEEPS):
             best = [gains[a] + _DISCOUNT * self._after(table, a, 0.0) for a in range(3)]
@@ -279,12 +292,6 @@ class Planner:
                         np.floor(x).astype(np.int64) + dx,
                     ]  # fmt: skip
         return result
-
-
-_SAFE_M = 0.005
-"""Room that racing runs keep according to the tables."""
-_DISCOUNT = 0.99
-_LAP_SWEEPS = 400
 
 
 def _wrap(angle_rad: Floats) -> Floats:

@@ -102,7 +102,11 @@ class SimRobot:
 
     def frame(self, width_px: int = 0, height_px: int = 0) -> npt.NDArray[np.uint8]:
         """The camera picture before preprocessing: uint8 [h, w, 3], RGB."""
-        return self._scene.frame(self._pose, width_px, height_px)
+        return self.look_from(self._pose, width_px, height_px)
+
+    def look_from(self, pose: Pose, width_px: int = 0, height_px: int = 0) -> npt.NDArray[np.uint8]:
+        """What the camera would see from another pose; the robot stays where it is."""
+        return self._scene.frame(pose, width_px, height_px)
 
     def sense(self) -> Sensed:
         """Camera, pose and bumper now."""

@@ -1,9 +1,9 @@
 """Worlds as data: a TOML file in `worlds/` read into typed, checked, immutable objects.
 
-A world is a set of closed wall loops with free space on their left: the outer boundary runs
-anticlockwise, islands run clockwise. Every wall segment has a texture; fixtures (doors, windows,
-notice boards, radiators) are painted onto segments. Units are metres and degrees, x to the right
-and y up on the map.
+A world is a set of closed wall loops with free space on their left: first the boundary, which runs
+anticlockwise, then islands, which run clockwise. Every wall segment has a texture; fixtures (doors,
+windows, notice boards, radiators) are painted onto segments. Units are metres and degrees, x to the
+right and y up on the map.
 """
 
 from __future__ import annotations
@@ -90,6 +90,12 @@ class Wall(_Part):
         s = self.segments
         return np.hypot(s[:, 2] - s[:, 0], s[:, 3] - s[:, 1])
 
+    @property
+    def area_m2(self) -> float:
+        """Enclosed area, negative if the points run clockwise."""
+        ax, ay, bx, by = self.segments.T
+        return float(np.sum(ax * by - bx * ay)) / 2.0
+
     def texture_of(self, segment: int) -> str:
         """Name of the texture of one segment."""
         return self.textures[segment if len(self.textures) > 1 else 0]
@@ -150,6 +156,7 @@ class World(_Part):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        self._check_loops()
         self._check_textures()
         for i, fixture in enumerate(self.fixtures):
             self._check_fixture(f"fixtures.{i}", fixture)
@@ -159,6 +166,13 @@ class World(_Part):
         if self.lap is not None and self.free(np.array([self.lap.centre]))[0]:
             raise ValueError("lap.centre: a robot could drive over it; put it on an island")
         return self
+
+    def _check_loops(self) -> None:
+        """Exactly one boundary, and it comes first; islands run the other way round."""
+        for i, wall in enumerate(self.walls):
+            if (wall.area_m2 > 0.0) != (i == 0):
+                way = "anticlockwise" if i == 0 else "clockwise (the first wall is the boundary)"
+                raise ValueError(f"walls.{i}: points must run {way}")
 
     def _check_textures(self) -> None:
         used = [("floor.texture", self.floor.texture), ("ceiling.texture", self.ceiling.texture)]
@@ -184,7 +198,7 @@ class World(_Part):
         if fixture.bottom_m + fixture.height_m > self.height_m:
             raise ValueError(f"{key}.height_m: higher than the wall ({self.height_m} m)")
 
-    @cached_property
+    @property
     def segments(self) -> Floats:
         """float64 [n, 4] of all walls: start x, y, end x, y; free space on the left."""
         return np.vstack([wall.segments for wall in self.walls])
@@ -224,6 +238,19 @@ class World(_Part):
         """Distance to the nearest wall, negative off free space; float64 [n, 2] to float64 [n]."""
         distance = self.distance(points)
         return np.where(self.free(points), distance, -distance)
+
+    def sight(self, points: Floats, headings_rad: Floats) -> Floats:
+        """How far one sees from points float64 [n, 2] in given directions [n]; inf if for ever."""
+        start, along = self.segments[:, :2], self.segments[:, 2:] - self.segments[:, :2]
+        look = np.column_stack([np.cos(headings_rad), np.sin(headings_rad)])[:, None, :]
+        offset = start - points[:, None, :]
+        cross = look[..., 0] * along[:, 1] - look[..., 1] * along[:, 0]
+        meets = np.abs(cross) > 1e-9  # else parallel
+        cross = np.where(meets, cross, 1.0)
+        far = (offset[..., 0] * along[:, 1] - offset[..., 1] * along[:, 0]) / cross
+        part = (offset[..., 0] * look[..., 1] - offset[..., 1] * look[..., 0]) / cross
+        hit = meets & (part > -1e-9) & (part < 1.0 + 1e-9) & (far > 1e-9)
+        return np.asarray(np.where(hit, far, np.inf).min(axis=1))
 
 
 def load_world(name: str) -> World:

@@ -1,0 +1,194 @@
+"""Measures a world and a motion together: what can be driven, and how hard it is (A4, E31).
+
+`corridor world check` prints the result of `survey`, `corridor world render` calls `render`.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from services.robot_driver.planner import TURNS, Motion, Planner
+from services.robot_driver.recovery import back_off
+from services.robot_driver.robot import Pose, Velocity
+from services.robot_driver.sim import SimRobot
+from services.robot_driver.views import render
+from services.robot_driver.world import World, load_world
+from shared.config import Config
+
+__all__ = ["RandomDrive", "corridor_width", "drive_randomly", "render", "survey"]
+
+Figures = dict[str, float | int | str | bool]
+
+PLANNED_ACTIONS = 500
+"""A pose counts as saved when a planned run of this many actions exists from it (A9)."""
+COMFORTABLE_M = 0.4
+"""Room to all walls on the lap that stands for an ordinary driving line."""
+_RECOVERIES = 1000
+_RACE_ACTIONS = 600
+
+
+@dataclass(frozen=True)
+class RandomDrive:
+    """What a robot met that chose actions uniformly at random and recovered after each bump."""
+
+    runs: npt.NDArray[np.int64]
+    """[n]: actions without a bump before each bump."""
+    poses: npt.NDArray[np.float64]
+    """[n, 3]: x, y, heading after each recovery."""
+    retreats_m: npt.NDArray[np.float64]
+    """[n]: way won by each recovery."""
+    physics_s: float
+    """Mean time that simulating one action took, without the camera."""
+
+
+def survey(config: Config) -> Figures:
+    """Measure the configured robot in the configured world; takes about a minute.
+
+    Returns:
+        Named figures: lengths in metres, angles in degrees, times in milliseconds.
+
+    Raises:
+        WorldError: The world is missing or wrong.
+    """
+    world, motion = load_world(config.robot.world), Motion.of(config.robot)
+    robot = SimRobot(config.robot, world, config.run.seed)
+    try:
+        driven = drive_randomly(robot, _RECOVERIES, config.run.seed)
+        pictures = _render_times(robot)
+    finally:
+        robot.close()
+    planner = Planner(world, motion, horizon=PLANNED_ACTIONS)
+    return {
+        "world": world.name,
+        **_geometry(world, motion),
+        **_laps(planner),
+        **_random_figures(driven),
+        **_saved(planner, driven),
+        **pictures,
+        "physics_ms": driven.physics_s * 1e3,
+    }
+
+
+def drive_randomly(robot: SimRobot, bumps: int, seed: int) -> RandomDrive:
+    """Drive uniformly random actions until so many bumps, each followed by `back_off` (E9, E11)."""
+    config = robot.config
+    draw = np.random.default_rng(seed)
+    turns = [turn * config.turn_rad_s for turn in TURNS]
+    runs: list[int] = []
+    poses: list[tuple[float, float, float]] = []
+    retreats: list[float] = []
+    actions = done = 0
+    spent = 0.0
+    while len(runs) < bumps:
+        robot.drive(Velocity(config.speed_m_s, 0.0, turns[int(draw.integers(3))]))
+        began = time.perf_counter()
+        bumped = robot.run(config.period_s, stop_on_contact=True)
+        spent += time.perf_counter() - began
+        actions, done = actions + 1, done + 1
+        if bumped:
+            runs.append(actions - 1)
+            actions = 0
+            retreats.append(back_off(robot, config, float(draw.uniform(-math.pi, math.pi))))
+            poses.append((robot.pose.x_m, robot.pose.y_m, robot.pose.heading_rad))
+    return RandomDrive(np.array(runs), np.array(poses), np.array(retreats), spent / done)
+
+
+def corridor_width(world: World, spacing_m: float = 0.1) -> float:
+    """Smallest distance straight across from any wall to the wall opposite it."""
+    narrowest = math.inf
+    for ax, ay, bx, by in world.segments:
+        length = math.hypot(bx - ax, by - ay)
+        part = (np.arange(max(1, round(length / spacing_m))) + 0.5) * spacing_m / length
+        part = part[part < 1.0]
+        points = np.column_stack([ax + part * (bx - ax), ay + part * (by - ay)])
+        across = np.full(len(points), math.atan2(bx - ax, -(by - ay)))
+        if len(points):
+            narrowest = min(narrowest, float(world.sight(points, across).min()))
+    return narrowest
+
+
+def _geometry(world: World, motion: Motion) -> Figures:
+    width = corridor_width(world)
+    circle = motion.turning_radius_m + motion.radius_m
+    x0, y0, x1, y1 = world.bounds
+    grid = np.mgrid[x0:x1:0.05, y0:y1:0.05].reshape(2, -1).T
+    return {
+        "step_m": motion.step_m,
+        "turn_per_action_deg": math.degrees(motion.turn_rad),
+        "turning_radius_m": motion.turning_radius_m,
+        "corridor_width_m": width,
+        "full_circle_needs_width_m": 2.0 * circle,
+        "full_circle_fits_narrowest_part": 2.0 * circle < width,
+        "full_circle_fits_somewhere": circle < float(world.clearance(grid).max()),
+    }
+
+
+def _laps(planner: Planner) -> Figures:
+    world = planner.world
+    if world.lap is None:
+        return {}
+    figures: Figures = {}
+    if len(world.walls) == 2:  # the middle between boundary and island
+        middle = sum(float(wall.lengths.sum()) for wall in world.walls) / 2.0
+        figures["centre_line_lap_m"] = middle
+        figures["centre_line_lap_actions"] = middle / planner.motion.step_m
+    start = world.starts[0]
+    for name, direction, keep in (
+        ("fastest_lap_left_actions", 1, 0.005),
+        ("fastest_lap_right_actions", -1, 0.005),
+        ("comfortable_lap_actions", 1, COMFORTABLE_M),
+    ):
+        pose = np.array([start.x_m, start.y_m, math.radians(direction * start.heading_deg)])
+        run = planner.race(pose, _RACE_ACTIONS, direction, keep)
+        survived = int(run.survived[0])
+        angle = float(planner.winding(run.poses[: survived + 1, 0])[-1])
+        laps = abs(angle) / (2.0 * math.pi)
+        figures[name] = survived / laps if laps > 0.5 else math.inf
+    run = planner.drive(pose[None, :], PLANNED_ACTIONS)
+    figures["best_fitness_from_start"] = int(run.survived[0])
+    return figures
+
+
+def _random_figures(driven: RandomDrive) -> Figures:
+    return {
+        "random_actions_to_bump_mean": float(driven.runs.mean()),
+        "random_actions_to_bump_median": float(np.median(driven.runs)),
+        "random_bumps_in_first_action": float((driven.runs == 0).mean()),
+        "retreat_mean_m": float(driven.retreats_m.mean()),
+        "recoveries": len(driven.runs),
+    }
+
+
+def _saved(planner: Planner, driven: RandomDrive) -> Figures:
+    survived = planner.drive(driven.poses, PLANNED_ACTIONS).survived
+    return {
+        f"recoveries_saved_for_{PLANNED_ACTIONS}_actions": float(
+            (survived >= PLANNED_ACTIONS).mean()
+        ),
+        "best_fitness_after_recovery_mean": float(survived.mean()),
+    }
+
+
+def _render_times(robot: SimRobot, repeats: int = 100) -> Figures:
+    start = robot.world.starts[0]
+
+    def look(width: int, height: int) -> Callable[[int], object]:
+        return lambda i: robot.look_from(Pose(start.x_m, start.y_m, float(i)), width, height)
+
+    return {
+        f"render_{width}x{height}_ms": _mean_ms(look(width, height), repeats)
+        for width, height in ((75, 50), (150, 100))
+    }
+
+
+def _mean_ms(work: Callable[[int], object], repeats: int) -> float:
+    began = time.perf_counter()
+    for i in range(repeats):
+        work(i)
+    return (time.perf_counter() - began) / repeats * 1e3

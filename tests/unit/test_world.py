@@ -1,0 +1,143 @@
+"""World files: typed, checked, refused with one clear line; geometry against naive oracles."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from services.robot_driver.world import WORLDS, World, WorldError, load_world, read_world
+
+PLUS = (WORLDS / "plus.toml").read_text(encoding="utf-8")
+
+
+def changed(folder: Path, old: str, new: str, count: int = 1) -> Path:
+    assert old in PLUS
+    path = folder / "plus.toml"
+    path.write_text(PLUS.replace(old, new, count), encoding="utf-8")
+    return path
+
+
+def test_plus_is_a_corridor_of_constant_width_round_a_plus():
+    world = load_world("plus")
+    outer, island = world.walls
+    assert len(outer.points) == len(island.points) == 12
+    # The boundary is the plus dilated by a square: every corner is 2.2 m out along both axes.
+    assert max(x for x, _ in outer.points) - max(x for x, _ in island.points) == pytest.approx(2.2)
+    middle = (outer.lengths.sum() + island.lengths.sum()) / 2
+    assert middle == pytest.approx(30.4)
+    assert all(world.free(np.array([[s.x_m, s.y_m]]))[0] for s in world.starts)
+
+
+def test_every_world_that_comes_along_can_be_read():
+    for path in WORLDS.glob("*.toml"):
+        assert read_world(path).name == path.stem
+
+
+def test_reading_twice_gives_the_same_world_and_a_change_another_fingerprint(tmp_path: Path):
+    world = load_world("plus")
+    assert load_world("plus") == world
+    other = read_world(changed(tmp_path, "height_m = 2.6", "height_m = 2.7"))
+    assert other.fingerprint != world.fingerprint
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("height_m = 2.6", "height_m = -2.6", "plus.toml: height_m: "),
+        ("height_m = 2.6", 'height_m = "high"', "plus.toml: height_m: "),
+        ("height_m = 2.6", "heigth_m = 2.6", "plus.toml: height_m: Field required"),
+        ("height_m = 2.6", "height_m = 2.6\nlight = 1", "plus.toml: light: Extra inputs"),
+        ("height_m = 2.6", "height_m = 2.6\nheight_m = 2.7", "plus.toml: Cannot overwrite"),
+        ('name = "plus"', 'name = "minus"', "name: 'minus' does not match the file name"),
+        ('name = "island"', 'name = "outer"', "walls: two walls are named 'outer'"),
+        ('texture = "linoleum"', 'texture = "lino"', "floor.texture: no texture named 'lino'"),
+        ('"green", "green"', '"green", "grass"', "walls.0.textures.1: no texture named 'grass'"),
+        ('"green", "green", ', '"green", ', "walls.0: expected 1 or 12 textures"),
+        ("[4.9, 3.1]", "[4.9, -3.1]", "walls.0: two neighbouring points are the same"),
+        ("[4.9, 3.1]", "[4.9, nan]", "walls.0.points.1.1: "),
+        ("[4.9, 3.1]", "[4.9]", "walls.0.points.1.1: Field required"),
+        ("x_m = 3.8", "x_m = 2.0", "starts.0: (2.0, 0.0) is not in free space"),
+        ("centre = [0.0, 0.0]", "centre = [3.8, 0.0]", "lap.centre: a robot could drive over it"),
+        ("segment = 0", "segment = 12", "fixtures.0.segment: 'outer' has 12 segments"),
+        ("at_m = 1.0", "at_m = 0.4", "fixtures.0.at_m: does not fit onto a segment of 6.20 m"),
+        ('wall = "outer"', 'wall = "inner"', "fixtures.0.wall: no wall named 'inner'"),
+        ("height_m = 2.1", "height_m = 2.7", "fixtures.0.height_m: higher than the wall"),
+        ('kind = "door"', 'kind = "gate"', "fixtures.0.kind: Input should be 'door'"),
+        ("rgb = [72, 96, 132]", "rgb = [72, 96, 256]", "fixtures.0.rgb.2: "),
+        ("at_m = 1.0", "at_m = true", "fixtures.0.at_m: "),
+    ],
+)
+def test_wrong_files_are_refused_with_one_line_naming_file_and_key(
+    tmp_path: Path, old: str, new: str, message: str
+):
+    with pytest.raises(WorldError) as refused:
+        read_world(changed(tmp_path, old, new))
+    assert message in str(refused.value)
+    assert str(refused.value).startswith("plus.toml: ")
+    assert "\n" not in str(refused.value)
+
+
+def test_loops_must_have_free_space_on_their_left():
+    world = load_world("plus")
+    tree = world.model_dump()
+    tree["walls"][1]["points"] = tree["walls"][1]["points"][::-1]
+    with pytest.raises(ValueError, match=r"walls\.1: .*clockwise"):
+        World.model_validate(tree)
+    tree = world.model_dump()
+    tree["walls"][0]["points"] = tree["walls"][0]["points"][::-1]
+    with pytest.raises(ValueError, match=r"walls\.0: .*clockwise"):
+        World.model_validate(tree)
+
+
+def test_unknown_worlds_and_unreadable_files_are_refused(tmp_path: Path):
+    with pytest.raises(WorldError, match=r"no world named 'maze'; there are: .*plus"):
+        load_world("maze")
+    with pytest.raises(WorldError, match=r"gone\.toml"):
+        read_world(tmp_path / "gone.toml")
+    (tmp_path / "bad.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(WorldError, match=r"bad\.toml"):
+        read_world(tmp_path / "bad.toml")
+
+
+@given(x=st.floats(-6, 6), y=st.floats(-6, 6))
+@settings(max_examples=200, deadline=None)
+def test_clearance_matches_the_plus_written_out_by_hand(x: float, y: float):
+    def in_plus(reach: float, half: float) -> bool:
+        return (abs(x) < reach and abs(y) < half) or (abs(y) < reach and abs(x) < half)
+
+    edges = [abs(abs(x) - c) for c in (0.9, 2.7, 3.1, 4.9)]
+    edges += [abs(abs(y) - c) for c in (0.9, 2.7, 3.1, 4.9)]
+    if min(edges) < 1e-6:
+        return
+    world = load_world("plus")
+    point = np.array([[x, y]])
+    assert world.free(point)[0] == (in_plus(4.9, 3.1) and not in_plus(2.7, 0.9))
+    naive = min(
+        math.dist((x, y), (ax + t * (bx - ax), ay + t * (by - ay)))
+        for ax, ay, bx, by in world.segments
+        for t in [
+            min(
+                1.0,
+                max(
+                    0.0,
+                    ((x - ax) * (bx - ax) + (y - ay) * (by - ay))
+                    / ((bx - ax) ** 2 + (by - ay) ** 2),
+                ),
+            )
+        ]
+    )
+    assert abs(world.clearance(point)[0]) == pytest.approx(naive)
+
+
+@given(x=st.floats(2.8, 4.8), y=st.floats(-3.0, 3.0), heading=st.floats(-4, 4))
+@settings(max_examples=100, deadline=None)
+def test_sight_ends_at_the_first_wall(x: float, y: float, heading: float):
+    world = load_world("plus")
+    far = float(world.sight(np.array([[x, y]]), np.array([heading]))[0])
+    way = np.arange(0.0, far, 0.01)[:, None] * [[math.cos(heading), math.sin(heading)]] + [[x, y]]
+    assert np.all(world.clearance(way) > -1e-9)
+    behind = [[x + (far + 0.001) * math.cos(heading), y + (far + 0.001) * math.sin(heading)]]
+    assert world.distance(np.array(behind))[0] <= 0.001 + 1e-9
