@@ -55,15 +55,15 @@ clean: ## remove the virtual environment and all caches; runs stay
 # ---------------------------------------------------------------- the virtual environment
 
 $(VENV)/.dev: $(VENV)/.all
-	$(PIP) install --quiet --constraint constraints.txt --editable '.[all,dev]'
+	$(PIP) install --constraint constraints.txt --editable '.[all,dev]'
 	@touch $@
 
 $(VENV)/.all: pyproject.toml constraints.txt $(VENV)/.made
 	@echo "installing into $(VENV), this takes a few minutes the first time"
 ifneq ($(strip $(TORCH_INDEX_URL)),)
-	$(PIP) install --quiet --constraint constraints.txt --no-deps --index-url '$(TORCH_INDEX_URL)' torch
+	$(PIP) install --constraint constraints.txt --no-deps --index-url '$(TORCH_INDEX_URL)' torch
 endif
-	$(PIP) install --quiet --constraint constraints.txt --editable '.[all]'
+	$(PIP) install --constraint constraints.txt --editable '.[all]'
 	@touch $@
 
 $(VENV)/.made:

@@ -93,7 +93,7 @@ def _service_command(name: str, package: str, text: str) -> None:
         tethered: Tethered = False,
     ) -> None:
         loaded = _load(preset, config, set_, run, seed, endpoint)
-        raise typer.Exit(_serve(package, loaded, run_dir or _folder(loaded), tethered))
+        raise typer.Exit(_serve(name, package, loaded, run_dir or _folder(loaded), tethered))
 
     app.command(name, help=text)(command)
 
@@ -206,9 +206,7 @@ def stop(
     endpoint: Endpoint = None,
     service: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="SERVICE", help="Only this service (robot_driver, actor, ...); repeatable."
-        ),
+        typer.Option(metavar="SERVICE", help="only this service (driver, actor, ...); repeatable."),
     ] = None,
 ) -> None:
     """Ask the services of a run to stop cleanly; `corridor up` ends with them."""
@@ -266,7 +264,7 @@ def world_render(
     out: Annotated[Path, typer.Option(help="Folder for the PNG files.")] = Path("renders"),
 ) -> None:
     """Write a top view and camera views of a world as PNG files."""
-    survey = import_role("services.robot_driver.survey", "robot_driver")
+    survey = import_role("services.robot_driver.survey", "driver")
     survey.render(name, out)
     typer.echo(f"written to {out}")
 
@@ -280,7 +278,7 @@ def world_check(
 ) -> None:
     """Measure a world: lap length, corridor width, turning circle, how many poses can be saved."""
     loaded = _load(preset, config, set_, others={"robot.world": name})
-    survey = import_role("services.robot_driver.survey", "robot_driver")
+    survey = import_role("services.robot_driver.survey", "driver")
     for key, value in survey.survey(loaded).items():
         typer.echo(f"{key:40} {value:.3f}" if isinstance(value, float) else f"{key:40} {value}")
 
@@ -315,7 +313,7 @@ def _folder(config: Config) -> Path:
     return Path("runs") / config.run.name
 
 
-def _serve(package: str, config: Config, folder: Path, tethered: bool) -> int:
+def _serve(name: str, package: str, config: Config, folder: Path, tethered: bool) -> int:
     """Run one service until it stops; returns its exit code."""
     if tethered:
         tether()
@@ -323,12 +321,12 @@ def _serve(package: str, config: Config, folder: Path, tethered: bool) -> int:
     from shared.settings import claim
 
     claim(folder, config)
-    setup_logging(package, folder)
+    setup_logging(name, folder)
 
     def run() -> None:
-        import_role(f"services.{package}.service", package).run(config, folder)
+        import_role(f"services.{package}.service", name).run(config, folder)
 
-    return guarded(package, run)
+    return guarded(name, run)
 
 
 def import_role(module: str, role: str) -> Any:
@@ -338,7 +336,7 @@ def import_role(module: str, role: str) -> Any:
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] in {"services", "shared"}:
             raise
-        extra = "sim" if role == "robot_driver" else role
+        extra = "sim" if role == "driver" else role
         raise ConfigError(
             f"{role}: needs the Python package {error.name}, which is not installed: "
             f"pip install 'corridor[{extra}]'"

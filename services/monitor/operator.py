@@ -17,7 +17,7 @@ from shared.messages import Message, RobotCommand, RobotState, ServiceCommand, S
 Command = Literal["estop", "clear", "pause", "resume"]
 M = TypeVar("M", bound=Message)
 
-DRIVER = "robot_driver"
+DRIVER = "driver"
 STOP_ORDER = (DRIVER, "actor", "learner", "replay")
 ATTEMPTS, ATTEMPT_S = 3, 1.0
 GONE_WITHIN_S = 10.0

@@ -109,7 +109,7 @@ def report(config: Config, entries: Sequence[Entry], snapshot: Snapshot) -> Rend
 
 def _services(title: str, entries: Sequence[Entry]) -> Table:
     table = Table(title=title, title_justify="left")
-    for column in ("service", "id", "pid", "up", "version", "life", "configuration"):
+    for column in ("service", "id", "pid", "up", "version", "life", "config"):
         table.add_column(column, no_wrap=True)
     for entry in entries:
         peer, reply = entry.peer, entry.reply
@@ -118,7 +118,7 @@ def _services(title: str, entries: Sequence[Entry]) -> Table:
             if reply
             else ("-", "no answer", "-")
         )
-        table.add_row(peer.service, peer.id, *told, peer.life, peer.config)
+        table.add_row(peer.service, peer.id, *told, peer.life, peer.config[:8])
     return table
 
 
@@ -162,7 +162,7 @@ def _ping(bus: Bus, peer: Peer) -> ServiceReply | None:
 def _complete(entries: Sequence[Entry], snapshot: Snapshot) -> bool:
     """Whether everybody who is there has told something."""
     told = {
-        "robot_driver": bool(snapshot.robots),
+        "driver": bool(snapshot.robots),
         "actor": bool(snapshot.actors),
         "replay": snapshot.replay is not None,
         "learner": snapshot.learner is not None,

@@ -70,9 +70,9 @@ def run_all(config: Config, folder: Path, *, listen: str | None, given: bool) ->
         environment = {k: v for k, v in os.environ.items() if not k.startswith(settings.ENV_PREFIX)}
         supervisor = Supervisor(specs, folder / "logs", environment, [lock])
         ending = supervise(config, supervisor, stop)
-    reason = f"{ending.reason}; " if ending.reason else ""
+    text = ending.reason if ending.code else f"{ending.reason}; the run lies in {folder}"
     console = Console(stderr=ending.code != 0, highlight=False, soft_wrap=True)
-    console.print(f"corridor: {reason}all stopped, the run lies in {folder}", markup=False)
+    console.print(f"corridor: {text}", markup=False)
     return ending.code
 
 
@@ -87,7 +87,7 @@ def supervise(config: Config, supervisor: Supervisor, stop: threading.Event) -> 
             if ending is None and wanted and snapshot.episodes_done >= wanted:
                 ending = Ending(0, f"{wanted} episodes are done")
             if ending is None and stop.is_set():
-                ending = Ending(0, "")
+                ending = Ending(0, "all stopped")
             view = View(
                 config.run.name,
                 config.bus.endpoint,

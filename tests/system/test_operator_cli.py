@@ -120,7 +120,7 @@ def test_commands_reach_all_robots_and_print_what_they_acknowledge(
 
     with ExitStack() as stack:
         for robot in ("r1", "r2"):
-            stack.enter_context(fake_service(config, "robot_driver", robot, []))
+            stack.enter_context(fake_service(config, "driver", robot, []))
             stack.enter_context(
                 answering(config.bus, config.run.name, ROBOT_COMMAND, robot, answer)
             )
