@@ -7,6 +7,7 @@ stands in `shared.keys`. Arrays travel as raw little-endian bytes whose size is 
 
 from __future__ import annotations
 
+import hashlib
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -71,7 +72,7 @@ class Observation(Message):
     stamp_s: float
     """Simulated time in lockstep, the driver's monotonic clock in realtime."""
     laps_left: Count = 0
-    """Laps completed anticlockwise (turning left) since the life began, where the world has laps."""
+    """Laps completed anticlockwise since the life began, where the world has a lap line."""
     laps_right: Count = 0
     """Laps completed clockwise."""
 
@@ -127,8 +128,10 @@ class RobotState(Message):
 
 
 class Episode(Message):
-    """The samples one episode releases, asking to be stored. Actor to replay, answered by
-    `EpisodeAck`. Identity is (robot, life, number): the same one is stored once, however often sent.
+    """The samples one episode releases, asking to be stored.
+
+    Actor to replay, answered by `EpisodeAck`. Identity is (robot, life, number): the same one is
+    stored once, however often it is sent.
     """
 
     robot: Ident
@@ -141,7 +144,7 @@ class Episode(Message):
     ended: Literal["bump", "full", "interrupted"]
     bump: bool
     weights_version: Count
-    """Target network that predicted the rewards, and the least one replay must use for this turn."""
+    """Target network that predicted the rewards; replay uses it or a newer one for this turn."""
     fitness: Count
     """Actions without a bump including carried-over ones, at most 500 (A37, E10)."""
     actions: Count
@@ -205,6 +208,12 @@ class Episode(Message):
     def count(self) -> int:
         """Number of samples n."""
         return len(self.sample_actions)
+
+    @property
+    def digest(self) -> str:
+        """16 hex digits over what was seen, done and rewarded: equal runs have equal digests."""
+        parts = (self.images, self.sample_actions, self.sample_rewards, self.positions)
+        return hashlib.sha256(b"".join(parts)).hexdigest()[:16]
 
 
 class EpisodeAck(Message):

@@ -423,7 +423,7 @@ def _summary(episode: Episode) -> dict[str, Any]:
     """What is kept of a submission beside its samples."""
     names = (
         "robot life number fill ended bump weights_version fitness actions dropped_samples "
-        "dropped_episodes robot_life last_sequence laps_left laps_right"
+        "dropped_episodes robot_life last_sequence laps_left laps_right digest"
     )
     return {name: getattr(episode, name) for name in names.split()}
 

@@ -1,0 +1,188 @@
+"""The real system in real processes: router and four services, killed and restarted at will."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from waiting import wait_until
+
+from shared import settings
+from shared.bus import Bus, Inbox
+from shared.config import Config
+from shared.keys import LEARNER_STATE, REPLAY_STATE
+from shared.messages import LearnerState, Message, ReplayState
+
+SERVICES = ("replay", "learner", "actor", "driver")
+ALL = ("router", *SERVICES)
+
+
+def free_port() -> int:
+    """A port nobody uses now; the router of a cluster must keep its port over restarts."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def make_config(run_name: str, **sections: dict[str, object]) -> Config:
+    """A configuration with a narrow network, quick periods and an endpoint of its own."""
+    tree: dict[str, dict[str, object]] = {
+        "run": {"name": run_name, "seed": 7},
+        "bus": {
+            "endpoint": f"tcp/127.0.0.1:{free_port()}",
+            "heartbeat_s": 0.2,
+            "request_timeout_s": 2.0,
+        },
+        "robot": {"resend_s": 0.2},
+        "episode": {"max_samples": 60, "horizon": 20},
+        "network": {"filters": 8},
+        "memory": {"capacity": 400, "equalise_every": 10},
+        "learning": {"batch_size": 32, "fit_every": 15, "mini_batches_per_episode": 2},
+    }
+    for section, values in sections.items():
+        tree.setdefault(section, {}).update(values)
+    return Config.model_validate(tree)
+
+
+class Cluster:
+    """Processes of one run in one folder. Use as a context manager: leaving kills what is left."""
+
+    def __init__(self, config: Config, folder: Path) -> None:
+        self.config, self.folder = config, folder
+        self._file = folder.parent / f"{folder.name}.toml"
+        settings.write(config, self._file)
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._bus: Bus | None = None
+        self._inbox: Inbox | None = None
+        self._newest: dict[type[Message], Message] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._bus is not None:
+            self._bus.close()
+        for name in list(self._processes):
+            self._forget(name)
+
+    def start(self, *names: str) -> None:
+        """Start router or services as a user would, each in a process of its own."""
+        for name in names:
+            command = [sys.executable, "-m", "services.cli", name, "--config", str(self._file)]
+            if name == "router":
+                command += ["--listen", self.config.bus.endpoint]
+            else:
+                command += ["--run-dir", str(self.folder)]
+            self._forget(name)
+            environment = {k: v for k, v in os.environ.items() if not k.startswith("CORRIDOR_")}
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with (self.folder / f"{name}.out").open("ab") as output:
+                self._processes[name] = subprocess.Popen(
+                    [*command, "--tethered"],
+                    stdin=subprocess.PIPE,
+                    stdout=output,
+                    stderr=output,
+                    env=environment,
+                    start_new_session=True,
+                )
+
+    def _forget(self, name: str) -> None:
+        process = self._processes.pop(name, None)
+        if process is not None:
+            process.kill()
+            process.wait(10)
+            assert process.stdin is not None
+            process.stdin.close()
+
+    def kill(self, *names: str) -> None:
+        """kill -9."""
+        for name in names:
+            self._processes[name].kill()
+            self._processes[name].wait(10)
+
+    def stop(self, *names: str) -> None:
+        """SIGTERM in this order, each to its clean end with exit code 0."""
+        for name in names:
+            process = self._processes[name]
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(20) == 0, f"{name} ended with {process.returncode}: {self.log(name)}"
+
+    def stop_all(self) -> None:
+        """Stop everything the way `corridor up` does."""
+        self.stop("driver", "actor", "replay", "learner", "router")
+
+    def log(self, name: str) -> str:
+        """The end of what a process printed."""
+        path = self.folder / f"{name}.out"
+        return path.read_text()[-3000:] if path.exists() else ""
+
+    @property
+    def bus(self) -> Bus:
+        """A client of the cluster's router, connected on first use."""
+        if self._bus is None:
+            self._bus = wait_until(self._connect, 20, "router answers")
+            self._inbox = self._bus.inbox()
+            self._inbox.subscribe(LEARNER_STATE, "main")
+            self._inbox.subscribe(REPLAY_STATE, "main")
+        return self._bus
+
+    def learner(self) -> LearnerState | None:
+        """The newest heartbeat of the learner."""
+        self._poll()
+        found = self._newest.get(LearnerState)
+        return found if isinstance(found, LearnerState) else None
+
+    def replay(self) -> ReplayState | None:
+        """The newest heartbeat of replay."""
+        self._poll()
+        found = self._newest.get(ReplayState)
+        return found if isinstance(found, ReplayState) else None
+
+    def stall(self, duration_s: float) -> None:
+        """Let a drawn time pass, so that what follows hits the others anywhere in their work."""
+        threading.Event().wait(duration_s)
+
+    def wait_episodes(self, count: int, timeout_s: float) -> None:
+        """Wait until the learner is done with this many episodes."""
+
+        def done() -> bool:
+            state = self.learner()
+            return state is not None and state.episode >= count
+
+        self.wait(done, timeout_s, f"{count} episodes learnt")
+
+    def wait(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
+        """Wait, and show every process's last words when the deadline passes."""
+        try:
+            wait_until(condition, timeout_s, what)
+        except AssertionError as error:
+            tails = "\n".join(f"--- {name}\n{self.log(name)}" for name in self._processes)
+            raise AssertionError(f"{error}\n{self.learner()}\n{self.replay()}\n{tails}") from None
+
+    def _connect(self) -> Bus | None:
+        from shared.errors import RouterMissing
+
+        try:
+            return Bus(self.config.bus, self.config.run.name)
+        except RouterMissing:
+            return None
+
+    def _poll(self) -> None:
+        assert self.bus
+        assert self._inbox is not None
+        for stream, cls in ((LEARNER_STATE, LearnerState), (REPLAY_STATE, ReplayState)):
+            for _, state in self._inbox.take(stream, cls):
+                self._newest[cls] = state
