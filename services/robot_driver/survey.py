@@ -139,19 +139,19 @@ def _laps(planner: Planner) -> Figures:
         figures["centre_line_lap_m"] = middle
         figures["centre_line_lap_actions"] = middle / planner.motion.step_m
     start = world.starts[0]
+    pose = np.array([start.x_m, start.y_m, math.radians(start.heading_deg)])
+    first = int(planner.drive(pose[None, :], PLANNED_ACTIONS).survived[0])
+    figures["best_fitness_from_start"] = first
     for name, direction, keep in (
         ("fastest_lap_left_actions", 1, 0.005),
         ("fastest_lap_right_actions", -1, 0.005),
         ("comfortable_lap_actions", 1, COMFORTABLE_M),
     ):
-        pose = np.array([start.x_m, start.y_m, math.radians(direction * start.heading_deg)])
         run = planner.race(pose, _RACE_ACTIONS, direction, keep)
         survived = int(run.survived[0])
         angle = float(planner.winding(run.poses[: survived + 1, 0])[-1])
-        laps = abs(angle) / (2.0 * math.pi)
+        laps = direction * angle / (2.0 * math.pi)
         figures[name] = survived / laps if laps > 0.5 else math.inf
-    run = planner.drive(pose[None, :], PLANNED_ACTIONS)
-    figures["best_fitness_from_start"] = int(run.survived[0])
     return figures
 
 
