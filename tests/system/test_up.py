@@ -1,0 +1,120 @@
+"""`corridor up` with the real services, a narrow network and a small memory."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import pytest
+from waiting import wait_until
+
+pytestmark = pytest.mark.system
+
+CORRIDOR = [sys.executable, "-m", "services.cli"]
+SMALL = (
+    "network.filters=8", "memory.capacity=200", "memory.equalise_every=3",
+    "learning.batch_size=8", "learning.fit_every=3", "learning.fit_epochs=1",
+)  # fmt: skip
+ENVIRONMENT = {k: v for k, v in os.environ.items() if not k.startswith("CORRIDOR_")}
+
+
+def start(folder: Path, *options: str) -> subprocess.Popen[str]:
+    sets = [f"--set={item}" for item in SMALL]
+    return subprocess.Popen(
+        [*CORRIDOR, "up", "--run-dir", str(folder), *sets, *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=ENVIRONMENT,
+    )
+
+
+def finish(process: subprocess.Popen[str], timeout_s: float) -> str:
+    """Wait for the end and return the output; whatever happens, nothing is left."""
+    try:
+        output, errors = process.communicate(timeout=timeout_s)
+    finally:
+        process.kill()
+    assert process.returncode == 0, output + errors
+    return output
+
+
+def corridor(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*CORRIDOR, *arguments], capture_output=True, text=True, env=ENVIRONMENT, check=False
+    )
+
+
+def episode_numbers(folder: Path) -> list[int]:
+    with (folder / "metrics" / "episodes.csv").open() as stream:
+        return [int(row["episode"]) for row in csv.DictReader(stream)]
+
+
+def test_a_run_ends_by_itself_and_is_continued_by_the_same_command(tmp_path: Path) -> None:
+    assert "4 episodes are done" in finish(start(tmp_path, "--episodes", "4"), 90)
+    first = episode_numbers(tmp_path)
+    assert first[:4] == [1, 2, 3, 4]
+    assert "8 episodes are done" in finish(start(tmp_path, "--episodes", "8"), 90)
+    assert episode_numbers(tmp_path) == list(range(1, len(episode_numbers(tmp_path)) + 1))
+    assert len(episode_numbers(tmp_path)) >= 8
+    for name in ("config.toml", "metrics", "logs", "tensorboard"):
+        assert (tmp_path / name).exists(), name
+    other = corridor("up", "--run-dir", str(tmp_path), "--set", "network.filters=16")
+    assert other.returncode == 2
+    assert "network.filters is 8 there, but 16 now" in other.stderr
+
+
+def test_a_running_run_is_found_watched_commanded_and_stopped(tmp_path: Path) -> None:
+    process = start(tmp_path)
+    try:
+        where = ("--run-dir", str(tmp_path))
+        wanted = ("driver", "actor", "replay", "learner")
+        require = [word for name in wanted for word in ("--require", name)]
+
+        def alive() -> bool:
+            return corridor("status", *where, *require).returncode == 0
+
+        wait_until(alive, 40, "all services to answer")
+        assert corridor("estop", *where).stdout == "robotino1: estop\n"
+        state = json.loads(corridor("status", *where, "--json").stdout)
+        assert state["robots"]["robotino1"]["state"] == "estop"
+        assert {service["service"] for service in state["services"]} == set(wanted)
+        assert corridor("clear", *where).returncode == 0
+        stopped = corridor("stop", *where)
+        assert stopped.returncode == 0, stopped.stdout
+        assert "all services have stopped" in finish(process, 20)
+    finally:
+        process.kill()
+
+
+def test_killed_services_are_restarted_and_the_run_goes_on(tmp_path: Path) -> None:
+    process = start(tmp_path)
+    try:
+        wait_until((tmp_path / "metrics" / "episodes.csv").exists, 40, "metrics")
+        for name in ("replay", "router", "actor"):
+            os.kill(started(tmp_path, name)[-1], signal.SIGKILL)
+            wait_until(partial(was_restarted, tmp_path, name), 20, f"{name} again")
+        before = len(episode_numbers(tmp_path))
+        wait_until(lambda: len(episode_numbers(tmp_path)) >= before + 2, 60, "two more episodes")
+        process.send_signal(signal.SIGINT)
+        assert "all stopped" in finish(process, 20)
+        numbers = episode_numbers(tmp_path)
+        assert numbers == list(range(1, len(numbers) + 1))
+    finally:
+        process.kill()
+
+
+def started(folder: Path, name: str) -> list[int]:
+    """Process ids that one child of the run has had so far."""
+    rows = (folder / "logs" / "up.log").read_text().splitlines()
+    return [int(row.rsplit(" ", 1)[1]) for row in rows if f" {name} started as process " in row]
+
+
+def was_restarted(folder: Path, name: str) -> bool:
+    return len(started(folder, name)) == 2
