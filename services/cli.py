@@ -215,36 +215,23 @@ def stop(
     raise typer.Exit(stop_services(_reach(run, run_dir, endpoint), service or []))
 
 
-@app.command()
-def estop(
-    run: Run = None, run_dir: RunDir = None, endpoint: Endpoint = None, robot: Robot = None
-) -> None:
-    """Stop robots at once; they stay stopped until `corridor clear`."""
-    _command_robots("estop", _reach(run, run_dir, endpoint), robot)
+def _robot_command(name: Command, text: str) -> None:
+    """Add a command that robots acknowledge."""
+
+    def command(
+        run: Run = None, run_dir: RunDir = None, endpoint: Endpoint = None, robot: Robot = None
+    ) -> None:
+        from services.monitor.operator import command_robots
+
+        raise typer.Exit(command_robots(_reach(run, run_dir, endpoint), name, robot))
+
+    app.command(name, help=text)(command)
 
 
-@app.command()
-def clear(
-    run: Run = None, run_dir: RunDir = None, endpoint: Endpoint = None, robot: Robot = None
-) -> None:
-    """Release the emergency stop of robots."""
-    _command_robots("clear", _reach(run, run_dir, endpoint), robot)
-
-
-@app.command()
-def pause(
-    run: Run = None, run_dir: RunDir = None, endpoint: Endpoint = None, robot: Robot = None
-) -> None:
-    """Let robots wait after the current action; they go on with `corridor resume`."""
-    _command_robots("pause", _reach(run, run_dir, endpoint), robot)
-
-
-@app.command()
-def resume(
-    run: Run = None, run_dir: RunDir = None, endpoint: Endpoint = None, robot: Robot = None
-) -> None:
-    """Let paused robots drive on."""
-    _command_robots("resume", _reach(run, run_dir, endpoint), robot)
+_robot_command("estop", "Stop robots at once; they stay stopped until `corridor clear`.")
+_robot_command("clear", "Release the emergency stop of robots.")
+_robot_command("pause", "Let robots wait after the current action, until `corridor resume`.")
+_robot_command("resume", "Let paused robots drive on.")
 
 
 # ---------------------------------------------------------------- without a run
@@ -348,12 +335,6 @@ def _reach(run: str | None, run_dir: Path | None, endpoint: str | None) -> Confi
     from services.monitor.running import reach
 
     return reach(run_dir, run, endpoint, os.environ)
-
-
-def _command_robots(command: Command, config: Config, robot: str | None) -> None:
-    from services.monitor.operator import command_robots
-
-    raise typer.Exit(command_robots(config, command, robot))
 
 
 if __name__ == "__main__":
