@@ -25,7 +25,13 @@ Positive = Annotated[float, Field(gt=0.0)]
 class Section(BaseModel):
     """Base of all sections: frozen, strict, unknown keys refused."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        strict=True,
+        allow_inf_nan=False,
+        use_attribute_docstrings=True,
+    )
 
 
 class RunConfig(Section):

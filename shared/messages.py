@@ -25,6 +25,8 @@ Life = Annotated[str, Field(pattern=r"^[0-9a-f]{12}$")]
 """12 hex digits, drawn at process start; a clean stop saves it and the next start carries on."""
 Ident = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,40}$")]
 Count = Annotated[int, Field(ge=0, lt=2**63)]
+Few = Annotated[int, Field(ge=0, lt=2**31)]
+"""Counted per submission and summed up for ever: bounded so that no sender can overflow a sum."""
 Image = Annotated[bytes, Field(min_length=IMAGE_BYTES, max_length=IMAGE_BYTES)]
 """uint8 [50, 75] grey, row by row from the top left."""
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -37,7 +39,13 @@ Interruption = Literal["", "pause", "estop", "late", "stop", "restart", "world"]
 class Message(BaseModel):
     """Base of all messages: frozen, strictly typed, unknown fields refused, no NaN."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        strict=True,
+        allow_inf_nan=False,
+        use_attribute_docstrings=True,
+    )
 
 
 def image_array(image: bytes) -> ImageArray:
@@ -145,13 +153,13 @@ class Episode(Message):
     bump: bool
     weights_version: Count
     """Target network that predicted the rewards; replay uses it or a newer one for this turn."""
-    fitness: Count
+    fitness: Few
     """Actions without a bump including carried-over ones, at most 500 (A37, E10)."""
-    actions: Count
+    actions: Few
     """Actions executed since the previous episode of this robot ended."""
-    dropped_samples: Count
+    dropped_samples: Few
     """Samples lost to interruptions and restarts since the previous submission."""
-    dropped_episodes: Count
+    dropped_episodes: Few
     """Open episodes lost with an actor or driver since the previous submission."""
     worlds: Annotated[tuple[Ident, ...], Field(min_length=1, max_length=64)]
     """Names that `sample_worlds` points into."""
@@ -174,8 +182,8 @@ class Episode(Message):
     robot_life: Life
     last_sequence: Count
     """Driver sequence of the newest sample released: what came after it is not stored yet."""
-    laps_left: Count = 0
-    laps_right: Count = 0
+    laps_left: Few = 0
+    laps_right: Few = 0
     """Laps completed while the samples were gathered."""
 
     @model_validator(mode="after")
@@ -202,6 +210,8 @@ class Episode(Message):
         rewards = np.frombuffer(self.sample_rewards, "<f4")
         if not bool(np.all(np.abs(rewards) <= 1.0)):  # also false for NaN
             raise ValueError("sample_rewards: expected -1..1")
+        if not bool(np.all(np.isfinite(np.frombuffer(self.positions, "<f4")))):
+            raise ValueError("positions: expected finite numbers")
         return self
 
     @property

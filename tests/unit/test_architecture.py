@@ -1,0 +1,64 @@
+"""Rules about the code as a whole that no single module can keep."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("shared", "services", "experiments")
+
+
+def imports() -> Iterator[tuple[str, str]]:
+    """(file, imported top-level package) of all our code, imports inside functions included."""
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text())):
+                names = []
+                if isinstance(node, ast.Import):
+                    names = [alias.name for alias in node.names]
+                elif isinstance(node, ast.ImportFrom) and node.module:
+                    names = [node.module]
+                for name in names:
+                    yield str(path.relative_to(ROOT)), name.split(".")[0]
+
+
+def users(package: str) -> set[str]:
+    return {file for file, name in imports() if name == package}
+
+
+def test_one_file_imports_zenoh() -> None:
+    assert users("zenoh") == {"shared/bus.py"}
+
+
+def test_one_file_imports_pybullet() -> None:
+    assert users("pybullet") == {"services/robot_driver/scene.py"}
+
+
+def test_one_file_imports_lmdb() -> None:
+    assert users("lmdb") == {"services/replay/storage.py"}
+
+
+def test_nothing_that_executes_what_it_reads() -> None:
+    for forbidden in ("pickle", "cloudpickle", "shelve", "marshal", "dill"):
+        assert users(forbidden) == set()
+    for package in PACKAGES:
+        for path in (ROOT / package).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.Call):
+                    called = ast.unparse(node.func)
+                    assert called not in {"eval", "exec", "torch.load"}, path
+
+
+def test_the_algorithm_has_no_clock_socket_file_logger_or_environment() -> None:
+    pure = {name for file, name in imports() if file.startswith("shared/rl/")}
+    assert pure <= {
+        "__future__", "collections", "contextlib", "dataclasses", "hashlib", "json", "typing",
+        "cv2", "numpy", "safetensors", "torch", "shared",
+    }  # fmt: skip
+
+
+def test_the_driver_on_hardware_needs_no_torch() -> None:
+    for file in users("torch"):
+        assert not file.startswith(("services/robot_driver", "services/router", "services/monitor"))
