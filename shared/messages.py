@@ -181,7 +181,7 @@ class Episode(Message):
     """float32 [n, 3]: x_m, y_m, heading_rad at each sample."""
     robot_life: Life
     last_sequence: Count
-    """Driver sequence of the newest sample released: what came after it is not stored yet."""
+    """Driver sequence of the newest action whose sample is released or counted as dropped."""
     laps_left: Few = 0
     laps_right: Few = 0
     """Laps completed while the samples were gathered."""
