@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from reprlib import repr as brief
 from typing import Any, TypeVar
 
 import msgpack
@@ -11,6 +12,8 @@ from shared.errors import BadMessage
 from shared.messages import PROTOCOL_VERSION, Message
 
 M = TypeVar("M", bound=Message)
+LONGEST_PLACE = 100
+"""Characters of a field name in an error: the sender may have made it up."""
 
 
 def encode(message: Message) -> bytes:
@@ -35,8 +38,9 @@ def decode(data: bytes, *types: type[M]) -> M:
     if not isinstance(fields, dict):
         raise BadMessage(f"expected {expected} as a map, got {type(fields).__name__}")
     version = fields.pop("v", None)
-    if version != PROTOCOL_VERSION or isinstance(version, bool):
-        raise BadMessage(f"expected {expected} of protocol {PROTOCOL_VERSION}, got {version!r}")
+    if type(version) is not int or version != PROTOCOL_VERSION:
+        wanted = f"{expected} of protocol {PROTOCOL_VERSION}"
+        raise BadMessage(f"expected {wanted}, got {brief(version)}")
     name = fields.pop("t", None)
     for cls in types:
         if cls.__name__ == name:
@@ -44,11 +48,13 @@ def decode(data: bytes, *types: type[M]) -> M:
                 return cls.model_validate(fields)
             except ValidationError as error:
                 raise BadMessage(f"{name}: {first_problem(error)}") from error
-    raise BadMessage(f"expected {expected}, got type {name!r}")
+    raise BadMessage(f"expected {expected}, got type {brief(name)}")
 
 
 def first_problem(error: ValidationError) -> str:
     """The first complaint of a validation, in one line without the (possibly huge) input."""
     problem = error.errors(include_url=False, include_input=False, include_context=False)[0]
     where = ".".join(str(part) for part in problem["loc"])
+    if len(where) > LONGEST_PLACE or not where.isprintable():
+        where = brief(where)
     return f"{where}: {problem['msg']}" if where else str(problem["msg"])
