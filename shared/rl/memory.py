@@ -89,10 +89,9 @@ class SampleStore:
 
     def remove(self, ids: Ids) -> None:
         """Remove the samples with these insertion numbers. Raises KeyError if one is missing."""
-        ranks = self.ranks(ids)
-        self._free.extend(int(slot) for slot in self.rows["slot"][ranks][::-1])
         keep = np.ones(len(self), np.bool_)
-        keep[ranks] = False
+        keep[self.ranks(ids)] = False
+        self._free.extend(int(slot) for slot in self.rows["slot"][~keep][::-1])
         self.rows = self.rows[keep]
 
     def ranks(self, ids: Ids) -> npt.NDArray[np.int64]:
@@ -103,7 +102,12 @@ class SampleStore:
         return ranks
 
     def set_rewards(self, ids: Ids, rewards: npt.NDArray[np.float32]) -> None:
-        """Replace the rewards of these samples. Raises KeyError if one is missing."""
+        """Replace the rewards of these samples.
+
+        Raises KeyError if one is missing and ValueError if a reward is outside -1..1.
+        """
+        if not np.all(np.abs(rewards) <= 1.0):
+            raise ValueError("reward: expected -1..1")
         self.rows["reward"][self.ranks(ids)] = rewards
 
     def images(self, ranks: npt.NDArray[np.int64]) -> Images:
