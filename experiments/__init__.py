@@ -1,0 +1,1 @@
+"""Ways to run the whole: the single-process loop and presets."""

@@ -73,7 +73,7 @@ class SingleProcess:
             observation = self.driver.observe()
 
     def _turn(self, episode: Episode) -> TurnDone:
-        """append -> discard -> equalise -> train or fit -> target rule -> publish (E25)."""
+        """Append -> discard -> equalise -> train or fit -> target rule -> publish (E25)."""
         config = self.config
         commit, self.counters = numbering.accept(self.counters, config.memory, episode)
         rows, images = sample_rows(

@@ -1,0 +1,1 @@
+"""One folder per service; `cli` starts them. Services never import each other."""

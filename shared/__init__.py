@@ -1,0 +1,1 @@
+"""What several services use: messages, keys, configuration, bus; the algorithm in `rl`."""

@@ -53,7 +53,11 @@ def zenoh_config(
         "scouting/gossip/enabled": False,
         "scouting/delay": 0,
         "connect/timeout_ms": 1000,
-        "connect/retry": {"period_init_ms": 50, "period_max_ms": 300, "period_increase_factor": 1.5},
+        "connect/retry": {
+            "period_init_ms": 50,
+            "period_max_ms": 300,
+            "period_increase_factor": 1.5,
+        },
         "transport/link/tx/lease": lease_ms,
         "adminspace/enabled": mode == "router",
     }.items():
@@ -76,7 +80,7 @@ class Request:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._query.drop()
+        self._query.drop()  # type: ignore[no-untyped-call]
 
     def reply(self, message: Message) -> None:
         """Send one answer; several are allowed where the stream says so."""
@@ -140,7 +144,7 @@ class Inbox:
                     self._ready.notify_all()
                     return
             query.reply_err(problem.encode())
-            query.drop()
+            query.drop()  # type: ignore[no-untyped-call]
 
         self._bus.queryable(stream.key(self._bus.run, ident), on_query)
 
@@ -189,7 +193,7 @@ class Inbox:
             except BadMessage as error:
                 self._refuse(stream, error)
                 query.reply_err(f"bad message: {error}".encode())
-                query.drop()
+                query.drop()  # type: ignore[no-untyped-call]
                 continue
             yield Request(stream, query, message)
 
@@ -311,8 +315,10 @@ class Bus:
             answered = True
             if reply.ok is None:
                 text = reply.err.payload.to_string() if reply.err else "unknown error"
-                raise PeerSilent(f"{key}: no answer in time") if text == "Timeout" else PeerRefused(
-                    f"{key}: {text}"
+                raise (
+                    PeerSilent(f"{key}: no answer in time")
+                    if text == "Timeout"
+                    else PeerRefused(f"{key}: {text}")
                 )
             payload = reply.ok.payload
             if len(payload) > REPLY_LIMIT:

@@ -214,7 +214,7 @@ class LearningConfig(Section):
     """Episodes between fitting phases; 0 never."""
     fit_epochs: int = Field(default=3, ge=1, le=1000)
     target_rule: Literal["bump", "episode"] = "episode"
-    """Copy train to target at the end of episodes with a bump (paper, A26) or of every one (E15)."""
+    """Copy train to target after episodes with a bump (paper, A26) or after every one (E15)."""
 
 
 class Numerics(Section):

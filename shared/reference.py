@@ -27,7 +27,8 @@ MARK = re.compile(r"(<!-- generated: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 def streams_table() -> str:
     """Every row of `shared.keys.STREAMS`."""
     lines = [
-        "| stream | key | payload -> answer | from -> to | delivery | rate | at most | queue | overflow |",
+        "| stream | key | payload -> answer | from -> to | delivery | rate | at most | queue "
+        "| overflow |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for s in STREAMS:
@@ -98,7 +99,8 @@ def main(paths: list[str]) -> None:
 
 
 def _message_table(cls: type[messages.Message]) -> str:
-    lines = [f"### {cls.__name__}", "", _text(cls.__doc__), "", "| field | type | meaning |", "|---|---|---|"]
+    head = ["| field | type | meaning |", "|---|---|---|"]
+    lines = [f"### {cls.__name__}", "", _text(cls.__doc__), "", *head]
     for name, field in cls.model_fields.items():
         optional = "" if field.is_required() else f", default `{field.default!r}`"
         lines.append(f"| `{name}` | {_type(field)}{optional} | {_text(field.description)} |")

@@ -41,7 +41,9 @@ def new_life() -> str:
 class Service:
     """One running service: its bus, its stop flag, and its answers to `ping` and `stop`."""
 
-    def __init__(self, name: str, ident: str, life: str, config: Config, bus: Bus, stop: StopFlag) -> None:
+    def __init__(
+        self, name: str, ident: str, life: str, config: Config, bus: Bus, stop: StopFlag
+    ) -> None:
         self.name, self.ident, self.life = name, ident, life
         self.config, self.bus, self.stop = config, bus, stop
         self.started_s = time.monotonic()
@@ -140,7 +142,7 @@ def service(name: str, ident: str, config: Config, *, life: str | None = None) -
     """Connect, meet the others and become visible; stop threads and close the bus at the end."""
     stop = StopFlag()
 
-    def on_signal(number: int, frame: FrameType | None) -> None:
+    def on_signal(number: int, _: FrameType | None) -> None:
         stop.set(signal.Signals(number).name)
 
     signal.signal(signal.SIGTERM, on_signal)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 from services.actor.actor import Actor
 from shared import statefile
 from shared.bus import Inbox
 from shared.codec import decode, encode
 from shared.config import Config
-from shared.errors import StateError
+from shared.errors import BadMessage, StateError
 from shared.keys import ACTION, ACTOR_STATE, EPISODE, LEARNER_STATE, OBSERVATION, PROGRESS
 from shared.messages import (
     Action,
@@ -24,18 +26,19 @@ from shared.messages import (
     RobotProgress,
 )
 from shared.rl.predictor import Predictor
-from shared.service import TICK_S, Service, new_life, service
+from shared.service import TICK_S, Service, Stopped, new_life, service
 from shared.weights import fetch
+
+Phase = Literal["waiting", "filling", "driving", "handing-over", "training", "stopped"]
 
 
 def run(config: Config, folder: Path) -> None:
     """Serve robots until stopped; a clean stop saves the open episodes."""
     with service("actor", "main", config) as me:
         loop = ActorLoop(me, folder / "actor")
-        try:
+        with suppress(Stopped):
             loop.run()
-        finally:
-            loop.save()
+        loop.save()  # not after a crash: what led to it must not come back
 
 
 @dataclass
@@ -72,10 +75,9 @@ class Session:
         if self._answered is not None and self._answered[0] == place:
             self._publish(self._answered[1])  # our answer was lost
             return
-        if self._answered is not None and self._answered[0][0] == place[0]:
-            if place < self._answered[0]:
-                self.stale_observations += 1
-                return
+        if self._answered and self._answered[0][0] == place[0] and place < self._answered[0]:
+            self.stale_observations += 1
+            return
         if self._observation is None or place != self._place(self._observation):
             self._observation = observation
             if self.actor.progress is not None:
@@ -127,16 +129,16 @@ class Session:
             state["answered"] = [list(self._answered[0]), encode(self._answered[1])]
         statefile.save(self._path, state)
 
-    def _restore(self, saved: dict[str, object]) -> None:
+    def _restore(self, saved: dict[str, Any]) -> None:
         try:
-            self.actor.restore(saved["actor"])  # type: ignore[arg-type]
-            self.resent_episodes = int(saved["resent_episodes"])  # type: ignore[call-overload]
+            self.actor.restore(saved["actor"])
+            self.resent_episodes = int(saved["resent_episodes"])
             if "pending" in saved:
-                self._pending = decode(saved["pending"], Episode)  # type: ignore[arg-type]
+                self._pending = decode(saved["pending"], Episode)
             if "answered" in saved:
-                place, answer = saved["answered"]  # type: ignore[misc]
-                self._answered = (tuple(place), decode(answer, Action))
-        except Exception as error:
+                (life, sequence, attempt), answer = saved["answered"]
+                self._answered = ((life, sequence, attempt), decode(answer, Action))
+        except (KeyError, TypeError, ValueError, BadMessage) as error:
             raise StateError(f"{self._path}: saved actor state does not fit: {error}") from error
 
     def _begin(self, observation: Observation) -> None:
@@ -228,7 +230,7 @@ class Session:
     def _place(self, observation: Observation) -> tuple[str, int, int]:
         return (observation.life, observation.sequence, observation.attempt)
 
-    def _phase(self, progress: RobotProgress | None) -> str:
+    def _phase(self, progress: RobotProgress | None) -> Phase:
         if self._me.stop.is_set():
             return "stopped"
         if progress is None:
@@ -286,4 +288,3 @@ class ActorLoop:
         for robot, session in self._sessions.items():
             state = session.state().model_copy(update={"undecodable": self._inbox.refused_total})
             self._me.bus.publish(ACTOR_STATE, state, robot)
-

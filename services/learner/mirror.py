@@ -60,6 +60,7 @@ class Mirror:
                     raise PeerSilent(f"snapshot at change {part.change}, expected {number}")
                 self.samples, self.number = samples, part.change
                 return
+            assert isinstance(part, Change)
             apply(samples, part)
             rows, messages = rows + len(part.ids) // 8, messages + 1
         raise PeerSilent(f"snapshot broke off after {rows} rows")

@@ -48,7 +48,7 @@ class LearnerLoop:
         self._weights = to_bytes(self._trainer.target_network)
         self._hash = weights_hash(self._weights)
         self._metrics = MetricsLog(folder, "training", tuple(COLUMNS.split()))
-        self._metrics.restart(self._metrics.kept(self.episode))  # type: ignore[arg-type]
+        self._metrics.restart(self._metrics.kept(self.episode))
         self._activity: Activity = "waiting"
         self._trained = Trained(0.0, 0, 0, 0)
         self._loss: float | None = None

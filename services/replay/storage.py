@@ -63,7 +63,9 @@ def _pack(value: Any) -> bytes:
     return bytes(msgpack.packb(value))
 
 
-def _unpack(data: bytes) -> Any:
+def _unpack(data: bytes | None) -> Any:
+    if data is None:
+        raise StateError("replay memory on disk: an entry that must exist is missing")
     return msgpack.unpackb(data, strict_map_key=False)
 
 
@@ -268,7 +270,7 @@ class Storage:
             upto = min(upto, newest)
             with txn.cursor(self._db["changes"]) as cursor:
                 oldest = _number(cursor.key()) if cursor.first() else newest + 1
-            if since < upto and since + 1 < oldest or since > newest:
+            if (since < upto and since + 1 < oldest) or since > newest:
                 yield FeedEnd(change=since, rows=0, messages=0, gone=True)
                 return
             rows = messages = 0

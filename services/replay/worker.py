@@ -95,7 +95,7 @@ class TurnWorker(threading.Thread):
                     self._wake.clear()
                     continue
                 self._turn(memory, *pending)
-        except BaseException as error:
+        except BaseException as error:  # noqa: BLE001  (raised again by the intake thread)
             self.failure = error
             self._me.stop.set(f"the turn worker ended: {error!r}")
         finally:

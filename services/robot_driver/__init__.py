@@ -1,1 +1,1 @@
-""""""
+"""Owns one robot: observations out, actions in, limits and recovery whatever the network says."""

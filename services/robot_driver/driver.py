@@ -209,9 +209,7 @@ class Driver:
     def _recover(self) -> None:
         """Back off by real motion and turn to a random heading drawn from the seed (E11)."""
         self.state = "recovering"
-        draw = generator(
-            self._config.run.seed, "recovery", self._config.robot.id, self.sequence
-        )
+        draw = generator(self._config.run.seed, "recovery", self._config.robot.id, self.sequence)
         back_off(self._robot, self._config.robot, float(draw.uniform(-math.pi, math.pi)))
         self._moving = False
         self.recoveries += 1

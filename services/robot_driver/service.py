@@ -77,7 +77,8 @@ class DriverLoop:
 
     def run(self) -> None:
         """Turn after turn until the service is to stop."""
-        turn = self._lockstep_turn if self._config.robot.timing == "lockstep" else self._realtime_turn
+        lockstep = self._config.robot.timing == "lockstep"
+        turn = self._lockstep_turn if lockstep else self._realtime_turn
         while not self._me.stop.is_set():
             turn()
 

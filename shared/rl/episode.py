@@ -99,14 +99,15 @@ class OpenEpisode:
 
 
 def with_current_max_q(
-    steps: tuple[Step, ...], values: npt.NDArray[np.float32], stale: npt.NDArray[np.int64], version: int
+    steps: tuple[Step, ...],
+    values: npt.NDArray[np.float32],
+    stale: npt.NDArray[np.int64],
+    version: int,
 ) -> tuple[Step, ...]:
     """Steps whose stale predictions are replaced by `values` [k, 3] of the current version."""
     fresh = list(steps)
     for row, index in enumerate(stale):
-        fresh[index] = replace(
-            fresh[index], max_q=float(values[row].max()), max_q_version=version
-        )
+        fresh[index] = replace(fresh[index], max_q=float(values[row].max()), max_q_version=version)
     return tuple(fresh)
 
 

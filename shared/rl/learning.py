@@ -61,8 +61,10 @@ class Trainer:
         self.episode_at_copy = 0
 
     def learn(self, samples: SampleStore, episode: int) -> Iterator[Trained]:
-        """Everything the network learns at one episode (E25): a fitting phase when due, else
-        `mini_batches_per_episode` steps. Yields after each mini-batch."""
+        """Everything the network learns at one episode (E25); yields after each mini-batch.
+
+        A fitting phase when due, else `mini_batches_per_episode` steps.
+        """
         if not len(samples):
             return
         if due(episode, self._learning.fit_every):

@@ -92,7 +92,15 @@ def initialised(config: NetworkConfig, seed: int) -> QNetwork:
             bound = float(np.sqrt(6.0 / (fan_in + fan_out)))
             drawn = generator(seed, "initial weights", name).uniform(-bound, bound, parameter.shape)
             parameter.copy_(torch.from_numpy(drawn.astype(np.float32)))
-    return network.to(memory_format=torch.channels_last)
+    return channels_last(network)
+
+
+def channels_last(network: QNetwork) -> QNetwork:
+    """The network with its convolutions laid out for speed; the values stay the same."""
+    for parameter in network.parameters():
+        if parameter.dim() == 4:
+            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+    return network
 
 
 def to_bytes(network: QNetwork) -> bytes:
@@ -110,7 +118,7 @@ def load_bytes(network: QNetwork, data: bytes) -> None:
         raise ValueError(f"weights: at most {MAX_WEIGHT_BYTES} bytes, got {len(data)}")
     try:
         tensors = load_safetensors(data)
-    except Exception as error:  # noqa: BLE001  (the library raises its own untyped errors)
+    except Exception as error:
         raise ValueError(f"weights: not safetensors: {error}") from error
     own = network.state_dict()
     if tensors.keys() != own.keys():

@@ -19,7 +19,7 @@ Floats = npt.NDArray[np.float64]
 def greedy_distribution(values: Values) -> Floats:
     """All probability on argmax_a Q(s, a) (E12), shared equally between exact ties (E8)."""
     best = values == values.max()
-    return best / best.sum()
+    return np.asarray(best / best.sum())
 
 
 def roulette_distribution(values: Values, temperature: float) -> Floats:

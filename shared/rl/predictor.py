@@ -17,7 +17,14 @@ import torch
 from torch import Tensor
 
 from shared.rl.descriptor import block_sums, describe
-from shared.rl.network import IMAGE_HEIGHT, IMAGE_WIDTH, QNetwork, load_bytes, weights_hash
+from shared.rl.network import (
+    IMAGE_HEIGHT,
+    IMAGE_WIDTH,
+    QNetwork,
+    channels_last,
+    load_bytes,
+    weights_hash,
+)
 
 if TYPE_CHECKING:
     from shared.config import NetworkConfig, Numerics
@@ -56,17 +63,21 @@ class Predictor:
         self.version = 0
         self.hash = ""
         self._numerics = numerics
-        self._network = QNetwork(network).to(memory_format=torch.channels_last)
-        self._network.to(numerics.device).eval().requires_grad_(False)
+        self._network = channels_last(QNetwork(network)).to(numerics.device)
+        self._network.eval().requires_grad_(False)
 
     def load(self, version: int, data: bytes) -> None:
         """Become `version`, given as safetensors bytes. Raises ValueError if they do not fit."""
         load_bytes(self._network, data)
         self.version, self.hash = version, weights_hash(data)
 
-    def all_values(self, images: Images, progress: Progress | None = None) -> npt.NDArray[np.float32]:
+    def all_values(
+        self, images: Images, progress: Progress | None = None
+    ) -> npt.NDArray[np.float32]:
         """Q(s, a) of all actions, clipped to [-1, 1] (A24, E8): float32 [n, 3]."""
-        return self._passes(images, lambda maps: self._network.all_values(maps).clamp(-1.0, 1.0), progress)
+        return self._passes(
+            images, lambda maps: self._network.all_values(maps).clamp(-1.0, 1.0), progress
+        )
 
     def values(
         self, images: Images, actions: npt.NDArray[np.uint8], progress: Progress | None = None
@@ -75,7 +86,9 @@ class Predictor:
         every = self.all_values(images, progress)
         return every[np.arange(len(images)), actions]
 
-    def descriptors(self, images: Images, progress: Progress | None = None) -> npt.NDArray[np.uint8]:
+    def descriptors(
+        self, images: Images, progress: Progress | None = None
+    ) -> npt.NDArray[np.uint8]:
         """Packed 120-bit descriptors uint8 [n, 15] (A29)."""
         return describe(self._passes(images, block_sums, progress))
 

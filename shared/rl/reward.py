@@ -61,7 +61,7 @@ def episode_rewards(
         penalty = bump_penalty(steps_to_bump, config.bump_decay, horizon)
     else:
         if n + horizon > m:
-            raise ValueError(f"{n} samples need {n + horizon} positions for full look-ahead, got {m}")
+            raise ValueError(f"{n} samples need {n + horizon} positions to look ahead, got {m}")
         last = t + horizon
         penalty = np.zeros(n)
     observed = travelled(xy_m, last, max_distance_m) + penalty

@@ -59,11 +59,9 @@ def _uncovered(signs: npt.NDArray[np.float32], least_product: int) -> Mask:
         start = max(stop - ROWS, 0)
         block = signs[start:stop]
         newer = signs[stop:][kept[stop:]]
-        covered = (
-            (block @ newer.T >= least_product).any(axis=1)
-            if len(newer)
-            else np.zeros(len(block), np.bool_)
-        )
+        covered = np.zeros(len(block), np.bool_)
+        if len(newer):
+            covered |= (block @ newer.T).max(axis=1) >= least_product
         own = block @ block.T >= least_product
         for row in range(len(block) - 1, -1, -1):
             inside = own[row, row + 1 :] & kept[start + row + 1 : stop]

@@ -1,7 +1,7 @@
 """One turn in the order of E25, as far as it concerns the memory.
 
-append -> discard (candidates as needed) -> equalise -> (the learner:) train or fit -> target rule ->
-checkpoint -> publish. The replay service and the single-process loop both call these.
+append -> discard (candidates as needed) -> equalise -> (the learner:) train or fit -> target rule
+-> checkpoint -> publish. The replay service and the single-process loop both call these.
 """
 
 from __future__ import annotations

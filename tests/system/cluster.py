@@ -118,7 +118,9 @@ class Cluster:
         for name in names:
             process = self._processes[name]
             process.send_signal(signal.SIGTERM)
-            assert process.wait(20) == 0, f"{name} ended with {process.returncode}: {self.log(name)}"
+            assert process.wait(20) == 0, (
+                f"{name} ended with {process.returncode}: {self.log(name)}"
+            )
 
     def stop_all(self) -> None:
         """Stop everything the way `corridor up` does."""

@@ -47,7 +47,7 @@ def test_replay_learner_and_router_killed_at_random_moments_still_end_equal(
 ) -> None:
     seed = secrets.randbits(32)
     draw = random.Random(seed)
-    print(f"kill seed {seed}")
+    print(f"kill seed {seed}")  # noqa: T201  (shown when the test fails)
     victims = ["replay", "learner", "router"]
     draw.shuffle(victims)
     moments = sorted(draw.sample(range(2, EPISODES - 2), len(victims)))
@@ -69,7 +69,7 @@ def test_clean_stops_and_resumes_still_end_equal(
 ) -> None:
     seed = secrets.randbits(32)
     draw = random.Random(seed)
-    print(f"stop seed {seed}")
+    print(f"stop seed {seed}")  # noqa: T201  (shown when the test fails)
     with Cluster(config, tmp_path / "run") as cluster:
         for episode in sorted(draw.sample(range(2, EPISODES - 2), 2)):
             cluster.start(*ALL)

@@ -1,4 +1,4 @@
-"""Actor or driver killed: the open episode is dropped and counted, everything else is there once."""
+"""Actor or driver killed: the open episode is dropped and counted, the rest is there once."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ def test_killed_mid_episode_loses_only_the_open_episode(victim: str, tmp_path: P
         inbox.subscribe(ACTOR_STATE)
 
         def mid_episode() -> bool:
-            return any(s.step >= 2 and s.phase == "driving" for _, s in inbox.take(ACTOR_STATE, ActorState))
+            states = inbox.take(ACTOR_STATE, ActorState)
+            return any(s.step >= 2 and s.phase == "driving" for _, s in states)
 
         wait_until(mid_episode, 60, "an open episode with some steps")
         cluster.kill(victim)
