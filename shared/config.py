@@ -221,11 +221,18 @@ class Numerics(Section):
     """Arithmetic of one role. It is part of the configuration: equal settings, equal bits."""
 
     device: Literal["cpu", "cuda"] = "cpu"
-    threads: int = Field(default=1, ge=1, le=256)
-    precision: Literal["float32", "bfloat16"] = "float32"
-    """bfloat16: convolutions and matrix products under autocast; sums and weights stay float32."""
+    threads: int = Field(default=1, ge=0, le=256)
+    """0: chosen when the run first starts, then fixed in its folder."""
+    precision: Literal["float32", "bfloat16", "auto"] = "float32"
+    """bfloat16: convolutions under autocast, everything else float32; auto: what is faster here,
+    measured when the run first starts, then fixed in its folder."""
     batch: int = Field(default=32, ge=1, le=4096)
     """Images per pass; inference pads to it so that results do not depend on company."""
+
+    @property
+    def settled(self) -> bool:
+        """Whether nothing is left to be chosen."""
+        return self.threads > 0 and self.precision != "auto"
 
 
 class NumericsConfig(Section):

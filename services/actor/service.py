@@ -12,7 +12,7 @@ from services.actor.actor import Actor
 from shared import statefile
 from shared.bus import Inbox
 from shared.codec import decode, encode
-from shared.config import Config
+from shared.config import Config, Numerics
 from shared.errors import BadMessage, StateError
 from shared.keys import ACTION, ACTOR_STATE, EPISODE, LEARNER_STATE, OBSERVATION, PROGRESS
 from shared.messages import (
@@ -25,6 +25,7 @@ from shared.messages import (
     ProgressRequest,
     RobotProgress,
 )
+from shared.numerics import settle
 from shared.rl.predictor import Predictor
 from shared.service import TICK_S, Service, Stopped, new_life, service
 from shared.weights import fetch
@@ -35,7 +36,7 @@ Phase = Literal["waiting", "filling", "driving", "handing-over", "training", "st
 def run(config: Config, folder: Path) -> None:
     """Serve robots until stopped; a clean stop saves the open episodes."""
     with service("actor", "main", config) as me:
-        loop = ActorLoop(me, folder / "actor")
+        loop = ActorLoop(me, folder / "actor", settle(config, folder, "actor"))
         with suppress(Stopped):
             loop.run()
         loop.save()  # not after a crash: what led to it must not come back
@@ -53,9 +54,11 @@ class Newest:
 class Session:
     """One robot: its actor, and where the hand-over of its last episode stands."""
 
-    def __init__(self, me: Service, robot: str, path: Path, newest: Newest) -> None:
+    def __init__(
+        self, me: Service, robot: str, path: Path, newest: Newest, numerics: Numerics
+    ) -> None:
         self._me, self._robot, self._path, self._newest = me, robot, path, newest
-        self._predictor = Predictor(me.config.network, me.config.numerics.actor)
+        self._predictor = Predictor(me.config.network, numerics)
         self.actor = Actor(me.config, robot, new_life(), self._predictor)
         self._pending: Episode | None = None
         """Finished, not yet acknowledged."""
@@ -246,8 +249,8 @@ class Session:
 class ActorLoop:
     """One thread: observations in, actions and episodes out."""
 
-    def __init__(self, me: Service, folder: Path) -> None:
-        self._me, self._folder = me, folder
+    def __init__(self, me: Service, folder: Path, numerics: Numerics) -> None:
+        self._me, self._folder, self._numerics = me, folder, numerics
         self._newest = Newest()
         self._sessions: dict[str, Session] = {}
         self._inbox: Inbox = me.bus.inbox()
@@ -276,7 +279,7 @@ class ActorLoop:
     def _session(self, robot: str) -> Session:
         if robot not in self._sessions:
             path = self._folder / f"{robot}.msgpack"
-            self._sessions[robot] = Session(self._me, robot, path, self._newest)
+            self._sessions[robot] = Session(self._me, robot, path, self._newest, self._numerics)
             self._me.log.info("serving robot %r", robot)
         return self._sessions[robot]
 

@@ -16,6 +16,7 @@ from shared.errors import StateError
 from shared.keys import LEARNER_STATE, REPLAY_STATE, TURNS, WEIGHTS
 from shared.messages import LearnerState, ReplayState, Turn, Turns, TurnsRequest
 from shared.metrics import MetricsLog
+from shared.numerics import settle
 from shared.rl.learning import Trained, Trainer
 from shared.rl.network import to_bytes, weights_hash
 from shared.service import TICK_S, Service, Stopped, service
@@ -40,9 +41,8 @@ class LearnerLoop:
         self._me, config = me, me.config
         self._path = folder / "learner" / "checkpoint.safetensors"
         self._identity = f"{config.run.name}/{config.run.seed}"
-        self._trainer = Trainer(
-            config.network, config.learning, config.numerics.learner, config.run.seed
-        )
+        numerics = settle(config, folder, "learner")
+        self._trainer = Trainer(config.network, config.learning, numerics, config.run.seed)
         self.episode = checkpoint.read(self._path, self._trainer, self._identity)
         self._mirror = Mirror()
         self._weights = to_bytes(self._trainer.target_network)

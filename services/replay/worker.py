@@ -21,6 +21,7 @@ from shared.bus import Inbox
 from shared.keys import LEARNER_STATE
 from shared.messages import LearnerState
 from shared.metrics import MetricsLog
+from shared.numerics import settle
 from shared.rl.descriptor import threshold_bits
 from shared.rl.memory import ReplayMemory
 from shared.rl.predictor import Predictor
@@ -70,7 +71,9 @@ class TurnWorker(threading.Thread):
         self._me, self._storage, self._notify = me, storage, notify
         self._config = me.config.memory
         self._wake = threading.Event()
-        self._predictor = Predictor(me.config.network, me.config.numerics.replay)
+        self._predictor = Predictor(
+            me.config.network, settle(me.config, folder, "replay")
+        )
         self._inbox: Inbox = me.bus.inbox()
         self._inbox.subscribe(LEARNER_STATE, "main")
         self._newest_version = 0

@@ -36,7 +36,9 @@ Progress = Callable[[int, int], None]
 
 @contextmanager
 def arithmetic(numerics: Numerics) -> Iterator[None]:
-    """Apply a role's thread count to the calling thread."""
+    """Apply a role's thread count to the calling thread. Raises ValueError for unsettled ones."""
+    if not numerics.settled:
+        raise ValueError(f"numerics must be settled before use, got {numerics}")
     if torch.get_num_threads() != numerics.threads:
         torch.set_num_threads(numerics.threads)
     yield
