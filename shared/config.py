@@ -235,12 +235,26 @@ class Numerics(Section):
         return self.threads > 0 and self.precision != "auto"
 
 
+class ActorNumerics(Numerics):
+    """One observation at a time."""
+
+    batch: int = Field(default=1, ge=1, le=4096)
+    """Observations per pass."""
+
+
+class LearnerNumerics(Numerics):
+    """Training: small parts stay in the processor's caches."""
+
+    batch: int = Field(default=16, ge=1, le=4096)
+    """Images per part of a mini-batch; their gradients are added up."""
+
+
 class NumericsConfig(Section):
     """Numerics by role; the single-process loop applies the same ones per role."""
 
-    actor: Numerics = Numerics(batch=1)
-    replay: Numerics = Numerics(batch=32)
-    learner: Numerics = Numerics(batch=16)
+    actor: ActorNumerics = ActorNumerics()
+    replay: Numerics = Numerics()
+    learner: LearnerNumerics = LearnerNumerics()
 
 
 class Config(Section):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,9 @@ from shared.weights import fetch
 
 Phase = Literal["waiting", "filling", "driving", "handing-over", "training", "stopped"]
 
+MAX_ROBOTS = 32
+"""Robots one actor serves; observations of more are refused and counted."""
+
 
 def run(config: Config, folder: Path) -> None:
     """Serve robots until stopped; a clean stop saves the open episodes."""
@@ -50,6 +54,15 @@ class Newest:
     version: int = 0
     data: bytes = b""
 
+    def note(self, state: LearnerState) -> None:
+        """Take over a state unless it is older: neither number ever falls, so it came late."""
+        known = self.state
+        if known is None or (state.episode, state.weights_version) >= (
+            known.episode,
+            known.weights_version,
+        ):
+            self.state = state
+
 
 class Session:
     """One robot: its actor, and where the hand-over of its last episode stands."""
@@ -65,6 +78,9 @@ class Session:
         self._observation: Observation | None = None
         """Waits for its action."""
         self._answered: tuple[tuple[str, int, int], Action] | None = None
+        self._life = ""
+        self._past_lives: deque[str] = deque(maxlen=100)
+        """Driver processes that are gone: what still comes of them is late."""
         self.stale_observations = 0
         self.resent_episodes = 0
         self._counted = (time.monotonic(), 0)
@@ -81,6 +97,12 @@ class Session:
         if self._answered and self._answered[0][0] == place[0] and place < self._answered[0]:
             self.stale_observations += 1
             return
+        if observation.life in self._past_lives:
+            self.stale_observations += 1
+            return
+        if self._life and observation.life != self._life:
+            self._past_lives.append(self._life)
+        self._life = observation.life
         if self._observation is None or place != self._place(self._observation):
             self._observation = observation
             if self.actor.progress is not None:
@@ -264,9 +286,12 @@ class ActorLoop:
         while not self._me.stop.is_set():
             self._inbox.wait(TICK_S)
             for _, state in self._inbox.take(LEARNER_STATE, LearnerState):
-                self._newest.state = state
+                self._newest.note(state)
             for robot, observation in self._inbox.take(OBSERVATION, Observation):
-                self._session(robot).offer(observation)
+                if robot in self._sessions or len(self._sessions) < MAX_ROBOTS:
+                    self._session(robot).offer(observation)
+                else:
+                    self._inbox.refused[OBSERVATION.name] += 1
             for session in self._sessions.values():
                 session.advance()
             self._beat()

@@ -63,12 +63,16 @@ class LearnerLoop:
     def run(self) -> None:
         """Learn turn by turn until stopped."""
         try:
+            self._check_replay()
             while not self._me.stop.is_set():
                 self._inbox.wait(TICK_S if self._known_turn <= self.episode else 0.0)
                 self._serve()
                 if self._known_turn > self.episode:
-                    for turn in self._ask_turns():
+                    turns = self._ask_turns(self.episode)
+                    for turn in turns:
                         self._turn(turn)
+                    if not turns:  # an announcement that was not true: wait for the next
+                        self._known_turn = self.episode
         finally:
             self._metrics.close()
 
@@ -79,21 +83,24 @@ class LearnerLoop:
                 for part in parts(self._trainer.version, self._weights):
                     request.reply(part)
         for _, state in self._inbox.take(REPLAY_STATE, ReplayState):
-            if state.turn < self.episode:
-                raise StateError(
-                    f"replay has turns up to {state.turn}, but the checkpoint {self._path} is of "
-                    f"episode {self.episode}: they do not belong together"
-                )
-            self._known_turn = state.turn
+            self._known_turn = max(self._known_turn, state.turn)
         now_s = time.monotonic()
         if announce or now_s >= self._next_beat_s:
             busy = self._activity in ("training", "fitting")
             self._next_beat_s = now_s + (0.25 if busy else self._me.config.bus.heartbeat_s)
             self._me.bus.publish(LEARNER_STATE, self._state())
 
-    def _ask_turns(self) -> tuple[Turn, ...]:
-        """The turns to learn next. Raises Stopped."""
-        request = TurnsRequest(since=self.episode)
+    def _check_replay(self) -> None:
+        """Refuse a replay memory that never had the episodes of our checkpoint."""
+        if self.episode and not self._ask_turns(self.episode - 1):
+            raise StateError(
+                f"replay has no turn {self.episode}, but the checkpoint {self._path} is of that "
+                f"episode: they do not belong together"
+            )
+
+    def _ask_turns(self, since: int) -> tuple[Turn, ...]:
+        """Turns after an episode, as replay has them. Raises Stopped."""
+        request = TurnsRequest(since=since)
 
         def attempt() -> Turns:
             self._serve()
