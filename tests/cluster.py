@@ -81,23 +81,30 @@ class Cluster:
     def start(self, *names: str) -> None:
         """Start router or services as a user would, each in a process of its own."""
         for name in names:
-            command = [sys.executable, "-m", "services.cli", name, "--config", str(self._file)]
             if name == "router":
-                command += ["--listen", self.config.bus.endpoint]
+                self._launch(name, name, "--listen", self.config.bus.endpoint)
             else:
-                command += ["--run-dir", str(self.folder)]
-            self._forget(name)
-            environment = {k: v for k, v in os.environ.items() if not k.startswith("CORRIDOR_")}
-            self.folder.mkdir(parents=True, exist_ok=True)
-            with (self.folder / f"{name}.out").open("ab") as output:
-                self._processes[name] = subprocess.Popen(
-                    [*command, "--tethered"],
-                    stdin=subprocess.PIPE,
-                    stdout=output,
-                    stderr=output,
-                    env=environment,
-                    start_new_session=True,
-                )
+                self._launch(name, name, "--run-dir", str(self.folder))
+
+    def start_second_driver(self, robot: str) -> None:
+        """Start another simulated robot of the same run."""
+        place = ("--run-dir", str(self.folder), "--set", f"robot.id={robot}")
+        self._launch(f"driver-{robot}", "driver", *place)
+
+    def _launch(self, name: str, service: str, *options: str) -> None:
+        self._forget(name)
+        command = [sys.executable, "-m", "services.cli", service, *options]
+        environment = {k: v for k, v in os.environ.items() if not k.startswith("CORRIDOR_")}
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with (self.folder / f"{name}.out").open("ab") as output:
+            self._processes[name] = subprocess.Popen(
+                [*command, "--config", str(self._file), "--tethered"],
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=output,
+                env=environment,
+                start_new_session=True,
+            )
 
     def _forget(self, name: str) -> None:
         process = self._processes.pop(name, None)
