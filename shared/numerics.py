@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 import time
 from pathlib import Path
 from statistics import median
@@ -17,6 +19,7 @@ from pydantic import ValidationError
 
 from shared.config import Config, NetworkConfig, Numerics
 from shared.errors import StateError
+from shared.settings import read_folder
 from shared.statefile import write_atomically
 
 Role = Literal["actor", "replay", "learner"]
@@ -36,7 +39,7 @@ def settle(config: Config, folder: Path, role: Role) -> Numerics:
     path = folder / "numerics" / f"{role}.json"
     if path.exists():
         try:
-            return Numerics.model_validate(json.loads(path.read_text()))
+            return type(wanted).model_validate(json.loads(path.read_text()))
         except ValidationError as error:
             raise StateError(f"{path}: damaged: {error.errors()[0]['msg']}") from error
         except ValueError as error:
@@ -47,9 +50,14 @@ def settle(config: Config, folder: Path, role: Role) -> Numerics:
 
 
 def settle_all(config: Config, folder: Path) -> None:
-    """Settle every role while nothing else runs that could disturb the measurement."""
-    for role in get_args(Role):
-        settle(config, folder, role)
+    """Settle every role now, while nothing else runs that could disturb the measurement.
+
+    In a process of its own: who calls this needs no torch afterwards. Raises StateError.
+    """
+    roles = [role for role in get_args(Role) if not getattr(config.numerics, role).settled]
+    command = [sys.executable, "-m", "shared.numerics", str(folder), *roles]
+    if roles and subprocess.run(command, check=False).returncode:
+        raise StateError(f"{folder}: threads and precision could not be settled, see above")
 
 
 def choose(config: Config, wanted: Numerics, role: Role) -> Numerics:
@@ -93,3 +101,15 @@ def _seconds(network: NetworkConfig, plain: Numerics, reduced: Numerics) -> floa
             predictor.all_values(images)
             spent.append(time.perf_counter() - start_s)
     return median(times[1]) / median(times[0])
+
+
+def main(folder: str, *roles: str) -> None:
+    """Settle some roles of the run in `folder`."""
+    config = read_folder(Path(folder))
+    for role in get_args(Role):
+        if role in roles:
+            settle(config, Path(folder), role)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -61,7 +61,7 @@ def run_all(config: Config, folder: Path, *, listen: str | None, given: bool) ->
         )
     stored = settings.claim(folder, config)
     with locked(folder) as lock, stop_on_signals() as stop:
-        settle_all(config, folder)  # now, while nothing else runs
+        settle_all(stored, folder)  # now, while nothing else runs
         own = None if given else listen or free_endpoint()
         endpoint = reachable(own) if own else config.bus.endpoint
         bus = config.bus.model_copy(update={"endpoint": endpoint})
