@@ -40,7 +40,7 @@ class RunConfig(Section):
     name: Name = "demo"
     """First chunk of every Zenoh key, so that two runs never mix."""
     seed: int = Field(default=1, ge=0, lt=2**63)
-    """The only seed: every random draw is a function of it, a role and a position (design 3)."""
+    """The only seed: every random draw is a function of it, a role and a position."""
     episodes: int = Field(default=0, ge=0)
     """Stop the run after this many counted episodes; 0 runs until stopped."""
 

@@ -202,7 +202,7 @@ class Session:
         self._pending = None
 
     def _may_act(self) -> bool:
-        """Whether the next action may be chosen now; loads the weights it needs (design 4)."""
+        """Whether the next action may be chosen now; loads the weights it needs."""
         progress, learner = self.actor.progress, self._newest.state
         limit = self._me.config.run.episodes
         if progress is None or learner is None:
@@ -233,7 +233,7 @@ class Session:
         self._publish(action)
 
     def _hold(self, observation: Observation) -> None:
-        """Real time while the network trains: stand still for a period (design 3)."""
+        """Real time while the network trains: stand still for a period."""
         self._observation = None
         self._publish(
             Action(

@@ -1,6 +1,6 @@
 """Counter-based randomness: every draw is a function of the seed, a role and a position.
 
-It does not matter which process draws, in which order, or how often it restarted (design 3).
+It does not matter which process draws, in which order, or how often it restarted.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Images are processed in passes of exactly `numerics.batch`, the last one padded, so that the value
 of one image is the same bits whatever it is grouped with in number; threads, precision and batch
-are configuration (design 3).
+are configuration (docs/architecture.md).
 """
 
 from __future__ import annotations
