@@ -16,7 +16,8 @@ from typing import Any, Literal
 import numpy as np
 
 from services.replay.numbering import Commit
-from services.replay.storage import Position, Storage
+from services.replay.storage import Storage
+from services.replay.tables import Position
 from shared.bus import Inbox
 from shared.keys import LEARNER_STATE
 from shared.messages import LearnerState
@@ -71,9 +72,7 @@ class TurnWorker(threading.Thread):
         self._me, self._storage, self._notify = me, storage, notify
         self._config = me.config.memory
         self._wake = threading.Event()
-        self._predictor = Predictor(
-            me.config.network, settle(me.config, folder, "replay")
-        )
+        self._predictor = Predictor(me.config.network, settle(me.config, folder, "replay"))
         self._inbox: Inbox = me.bus.inbox()
         self._inbox.subscribe(LEARNER_STATE, "main")
         self._newest_version = 0

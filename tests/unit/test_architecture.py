@@ -37,7 +37,7 @@ def test_one_file_imports_pybullet() -> None:
 
 
 def test_one_file_imports_lmdb() -> None:
-    assert users("lmdb") == {"services/replay/storage.py"}
+    assert users("lmdb") == {"services/replay/tables.py"}
 
 
 def test_nothing_that_executes_what_it_reads() -> None:

@@ -1,0 +1,178 @@
+"""The replay memory on disk (LMDB): what is acknowledged survives kill -9, exactly once.
+
+Images are written once and never changed; what changes lies beside them. Tables:
+
+meta      counters, change number, processed commit, threshold, identity of the run
+commits   commit number -> record of the submission (provenance, metrics)
+identity  robot, life, number -> commit number: the deduplication
+images    insertion number -> 3750 bytes
+samples   insertion number -> row (reward as inserted)
+dead      insertion number -> change number of its discard; kept until the feed forgets the change
+columns   "rewards": all rewards after the newest equalisation; "marks": descriptors and marks
+changes   change number -> kind and ids: the feed
+turns     global episode number -> what the learner needs to know
+
+One write transaction commits an episode, another one applies a whole turn: a kill at any moment
+leaves one of the two states, and the turn is done again from the first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import lmdb
+import msgpack
+import numpy as np
+import numpy.typing as npt
+
+from services.replay.numbering import Commit, Counters
+from shared.config import MemoryConfig
+from shared.errors import StateError
+from shared.messages import IMAGE_SHAPE
+from shared.rl.memory import SAMPLE
+
+SCHEMA = 1
+MAP_BYTES = 1 << 38
+"""Largest size of the file; only what is used exists."""
+REWARDS = np.dtype([("id", "<u8"), ("reward", "<f4")])
+MARKS = np.dtype(
+    [(name, *SAMPLE.fields[name][:1]) for name in ("id", "descriptor", "described_by")]  # type: ignore[index]
+    + [("candidate", "?"), ("forced", "?"), ("marked_by", "<u4")]
+)
+TABLES = ("meta", "commits", "identity", "images", "samples", "dead", "columns", "changes", "turns")
+Txn = Any
+
+
+def key_of(number: int) -> bytes:
+    """A number as key: big endian, so that keys sort like numbers."""
+    return number.to_bytes(8, "big")
+
+
+def number_of(key: bytes) -> int:
+    """The number behind a key."""
+    return int.from_bytes(key, "big")
+
+
+def pack(value: Any) -> bytes:
+    """Plain values as bytes."""
+    return bytes(msgpack.packb(value))
+
+
+def unpack(data: bytes | None) -> Any:
+    """What `pack` packed. Raises StateError when the entry is not there."""
+    if data is None:
+        raise StateError("replay memory on disk: an entry that must exist is missing")
+    return msgpack.unpackb(data, strict_map_key=False)
+
+
+@dataclass(frozen=True)
+class Position:
+    """How far the memory on disk has come."""
+
+    change: int
+    """Newest change number n."""
+    processed: int
+    """Newest commit whose turn is applied."""
+    turn: int
+    """Newest counted episode whose turn is applied."""
+    turn_change: int
+    threshold_percent: int
+
+
+class Tables:
+    """The open files, and what reading and writing share."""
+
+    def __init__(self, folder: Path, config: MemoryConfig, identity: str) -> None:
+        """Open or create. Raises StateError when the files belong to another run or schema."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self._config = config
+        self._env = lmdb.open(str(folder), map_size=MAP_BYTES, max_dbs=len(TABLES), max_readers=64)
+        self._db = {name: self._env.open_db(name.encode()) for name in TABLES}
+        with self._env.begin(write=True) as txn:
+            known = self._meta(txn, "identity")
+            if known is None:
+                self._put_meta(txn, "identity", [SCHEMA, identity])
+                self._put_meta(txn, "counters", Counters().to_dict())
+                start = Position(0, 0, 0, 0, config.threshold_percent)
+                self._put_meta(txn, "position", asdict(start))
+                self._put_meta(txn, "worlds", [])
+            elif list(known) != [SCHEMA, identity]:
+                raise StateError(
+                    f"{folder}: expected a replay memory of schema and run {[SCHEMA, identity]}, "
+                    f"found {list(known)}: choose another run folder"
+                )
+
+    def close(self) -> None:
+        """Close the files; all other threads must be done with them."""
+        self._env.close()
+
+    def counters(self) -> Counters:
+        """The counters as of the newest commit."""
+        with self._env.begin() as txn:
+            return Counters.from_dict(self._meta(txn, "counters"))
+
+    def position(self) -> Position:
+        """How far the turns have come."""
+        with self._env.begin() as txn:
+            return Position(**self._meta(txn, "position"))
+
+    def size(self) -> int:
+        """Samples in memory at the newest turn."""
+        with self._env.begin() as txn:
+            return len(self._alive(txn))
+
+    def _meta(self, txn: Txn, name: str) -> Any:
+        data = txn.get(name.encode(), db=self._db["meta"])
+        return None if data is None else unpack(data)
+
+    def _put_meta(self, txn: Txn, name: str, value: Any) -> None:
+        txn.put(name.encode(), pack(value), db=self._db["meta"])
+
+    def _alive(self, txn: Txn) -> list[int]:
+        """Insertion numbers of all samples whose append is applied and whose discard is not."""
+        processed = Position(**self._meta(txn, "position")).processed
+        data = txn.get(key_of(processed), db=self._db["commits"])
+        if data is None:
+            return []
+        commit = Commit(**unpack(data)["commit"])
+        end = commit.first_id + commit.stored
+        with txn.cursor(self._db["dead"]) as cursor:
+            dead = {number_of(key) for key in cursor.iternext(values=False)}
+        with txn.cursor(self._db["samples"]) as cursor:
+            ids = [number_of(key) for key in cursor.iternext(values=False)]
+        return [i for i in ids if i < end and i not in dead]
+
+    def _rows(self, txn: Txn, ids: list[int]) -> tuple[npt.NDArray[np.void], npt.NDArray[np.uint8]]:
+        keys = [key_of(i) for i in ids]
+        parts: dict[str, bytes] = {}
+        for table in ("samples", "images"):
+            with txn.cursor(self._db[table]) as cursor:
+                found = cursor.getmulti(keys)
+            if len(found) != len(keys):
+                raise StateError(f"replay {table}: {len(keys) - len(found)} of {len(keys)} missing")
+            parts[table] = b"".join(value for _, value in found)
+        rows = np.frombuffer(parts["samples"], SAMPLE).copy()
+        images = np.frombuffer(parts["images"], np.uint8).reshape(len(ids), *IMAGE_SHAPE)
+        return rows, images
+
+    def _stored_column(self, txn: Txn, name: str, dtype: np.dtype[np.void]) -> npt.NDArray[np.void]:
+        return np.frombuffer(txn.get(name.encode(), db=self._db["columns"]) or b"", dtype)
+
+    def _overlay_rewards(self, txn: Txn, rows: npt.NDArray[np.void]) -> None:
+        """Replace rewards as inserted by those of the newest equalisation."""
+        column = self._stored_column(txn, "rewards", REWARDS)
+        known, where = match(rows["id"], column["id"])
+        rows["reward"][known] = column["reward"][where]
+
+
+def match(
+    ids: npt.NDArray[np.uint64], known: npt.NDArray[np.uint64]
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
+    """Which of `ids` are in the ascending `known`, and where."""
+    if not len(known):
+        return np.zeros(len(ids), np.bool_), np.zeros(0, np.int64)
+    where = np.minimum(np.searchsorted(known, ids), len(known) - 1)
+    found = known[where] == ids
+    return found, where[found]
