@@ -22,8 +22,9 @@ from shared.rl.reward import episode_rewards
 class Actor:
     """Turns observations of one robot into actions and finished episodes.
 
-    For every observation call `finish` first and, once what it returned is committed, `act`. Between
-    the two the target network may change (only there: all actions of an episode come from one).
+    For every observation call `finish` first and, once what it returned is committed, `act`.
+    Between the two the target network may change (only there: all actions of an episode come from
+    one).
     """
 
     def __init__(self, config: Config, robot: str, life: str, predictor: Predictor) -> None:
@@ -56,20 +57,26 @@ class Actor:
         the driver's numbering tells how many there were.
         """
         self.progress = progress
+        if self._expected is not None:
+            return  # after a clean stop nothing is lost but what `finish` finds interrupted
         self._laps_before = (observation.laps_left, observation.laps_right)
-        if self._expected == (observation.life, observation.sequence):
-            return  # continues after a clean stop: nothing is lost
         if progress.robot_life in ("", observation.life):
             lost = observation.sequence - (progress.last_sequence + 1)
             self._drop(samples=lost, episodes=int(lost > 0))
-        else:
-            self._drop(samples=0, episodes=1)
+        else:  # what the driver's earlier life executed unstored cannot be known any more
+            self._drop(samples=observation.sequence, episodes=1)
 
     def finish(self, observation: Observation) -> Episode | None:
         """End the open episode if this observation ends it; return what is to be stored.
 
-        None when the episode goes on, or when it ended without releasing a sample.
+        None when the episode goes on, or when it ended without releasing a sample. A step whose
+        action the robot did not carry out (a late answer, a contact or a halt first) is taken
+        back first: it is neither an action nor a sample.
         """
+        if len(self.open) and self._unexecuted(self.open.steps[-1], observation):
+            self.open.retract()
+            self.actions -= 1
+            self._expected = (observation.life, observation.sequence)
         ending = self._ending(observation)
         if ending is None:
             return None
@@ -168,6 +175,11 @@ class Actor:
             self._config.episode, tuple(Step(**step) for step in state["steps"])
         )
 
+    def _unexecuted(self, newest: Step, observation: Observation) -> bool:
+        """Whether the driver waits, once more, for the action that this step had chosen."""
+        place = (observation.life, observation.sequence + 1)
+        return self._expected == place and newest.sequence == observation.sequence
+
     def _ending(self, observation: Observation) -> Ending | None:
         """How this observation ends the open episode, if it does (A9, E6, E10, E11)."""
         if not len(self.open):
@@ -207,6 +219,7 @@ class Actor:
         laps = (observation.laps_left, observation.laps_right)
         before, self._laps_before = self._laps_before, laps
         released = steps[: release.count]
+        settled = steps if release.ending == "interrupted" else released
         return Episode(
             robot=self._robot,
             life=self.life,
@@ -220,7 +233,7 @@ class Actor:
             dropped_samples=self._unreported_samples,
             dropped_episodes=self._unreported_episodes,
             robot_life=self._expected[0] if self._expected else observation.life,
-            last_sequence=released[-1].sequence,
+            last_sequence=settled[-1].sequence,
             laps_left=max(laps[0] - before[0], 0),
             laps_right=max(laps[1] - before[1], 0),
             **_columns(released, rewards),

@@ -74,6 +74,10 @@ class OpenEpisode:
             raise ValueError(f"an episode ends at {self._config.max_samples} samples")
         self._steps.append(step)
 
+    def retract(self) -> None:
+        """Take back the newest step: its action was never executed."""
+        self._steps.pop()
+
     @property
     def full(self) -> bool:
         """Whether the episode ends here even without a bump (A9: 500 samples)."""
