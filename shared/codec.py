@@ -1,4 +1,4 @@
-"""Messages to msgpack bytes and back. No pickle, nothing executed, sizes and types checked first."""
+"""Messages to msgpack bytes and back: nothing is executed, sizes and types are checked first."""
 
 from __future__ import annotations
 
@@ -34,7 +34,9 @@ def decode(data: bytes, *types: type[M]) -> M:
     try:
         fields = msgpack.unpackb(data, raw=False, use_list=False, strict_map_key=True)
     except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
-        raise BadMessage(f"expected {expected}, got {len(data)} bytes that are not msgpack: {error}") from error
+        raise BadMessage(
+            f"expected {expected}, got {len(data)} bytes that are not msgpack: {error}"
+        ) from error
     if not isinstance(fields, dict):
         raise BadMessage(f"expected {expected} as a map, got {type(fields).__name__}")
     version = fields.pop("v", None)

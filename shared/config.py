@@ -203,6 +203,8 @@ class LearningConfig(Section):
 
     mode: Literal["synchronous", "asynchronous"] = "synchronous"
     """Whether the robot waits while the network trains."""
+    max_lag_episodes: int = Field(default=50, ge=1, le=100_000)
+    """Asynchronous: the robot waits when the learner is this many episodes behind."""
     batch_size: int = Field(default=128, ge=1, le=4096)
     mini_batches_per_episode: int = Field(default=1, ge=0, le=1000)
     learning_rate: float = Field(default=0.00025, gt=0.0, le=1.0)

@@ -120,6 +120,14 @@ class Cluster:
             self._processes[name].kill()
             self._processes[name].wait(10)
 
+    def freeze(self, name: str) -> None:
+        """SIGSTOP: alive, but not answering."""
+        self._processes[name].send_signal(signal.SIGSTOP)
+
+    def thaw(self, name: str) -> None:
+        """SIGCONT."""
+        self._processes[name].send_signal(signal.SIGCONT)
+
     def stop(self, *names: str) -> None:
         """SIGTERM in this order, each to its clean end with exit code 0."""
         for name in names:

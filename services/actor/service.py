@@ -29,7 +29,7 @@ from shared.messages import (
 from shared.numerics import settle
 from shared.rl.predictor import Predictor
 from shared.service import TICK_S, Service, Stopped, new_life, service
-from shared.weights import fetch
+from shared.weights import WeightsFetcher
 
 Phase = Literal["waiting", "filling", "driving", "handing-over", "training", "stopped"]
 
@@ -48,11 +48,9 @@ def run(config: Config, folder: Path) -> None:
 
 @dataclass
 class Newest:
-    """What is known of the learner: its newest state, and the newest weights fetched."""
+    """The newest announcement of the learner."""
 
     state: LearnerState | None = None
-    version: int = 0
-    data: bytes = b""
 
     def note(self, state: LearnerState) -> None:
         """Take over a state unless it is older: neither number ever falls, so it came late."""
@@ -68,9 +66,16 @@ class Session:
     """One robot: its actor, and where the hand-over of its last episode stands."""
 
     def __init__(
-        self, me: Service, robot: str, path: Path, newest: Newest, numerics: Numerics
+        self,
+        me: Service,
+        robot: str,
+        path: Path,
+        newest: Newest,
+        weights: WeightsFetcher,
+        numerics: Numerics,
     ) -> None:
-        self._me, self._robot, self._path, self._newest = me, robot, path, newest
+        self._me, self._robot, self._path = me, robot, path
+        self._newest, self._weights = newest, weights
         self._predictor = Predictor(me.config.network, numerics)
         self.actor = Actor(me.config, robot, new_life(), self._predictor)
         self._pending: Episode | None = None
@@ -182,7 +187,7 @@ class Session:
     def _finish(self, observation: Observation) -> None:
         """End the open episode if this observation does. It needs the weights of the episode."""
         if len(self.actor.open) and self._predictor.version == 0:
-            self._load()
+            self._load(*self._weights.wait_for(1))
         self._pending = self._pending or self.actor.finish(observation)
 
     def _hand_over(self, episode: Episode) -> None:
@@ -209,22 +214,24 @@ class Session:
             return False
         if limit and progress.episode >= limit and not progress.filling:
             return False
-        synchronous = self._me.config.learning.mode == "synchronous"
-        if synchronous and learner.episode < progress.episode:
+        if self._lags(progress, learner):
             return False
         if self.actor.at_boundary or self._predictor.version == 0:
-            self._load()
+            self._load(*self._weights.newest)
+            synchronous = self._me.config.learning.mode == "synchronous"
+            return self._predictor.version >= (learner.weights_version if synchronous else 1)
         return True
 
-    def _load(self) -> None:
-        """Take up the newest target network. Raises Stopped."""
-        learner = self._newest.state
-        if learner is not None and learner.weights_version <= self._predictor.version:
-            return
-        if learner is None or self._newest.version < learner.weights_version:
-            fetched = self._me.insist("fetch weights", lambda: fetch(self._me.bus))
-            self._newest.version, self._newest.data = fetched
-        self._predictor.load(self._newest.version, self._newest.data)
+    def _lags(self, progress: RobotProgress, learner: LearnerState) -> bool:
+        """Whether the learner is farther behind than the robot may drive on."""
+        learning = self._me.config.learning
+        allowed = 0 if learning.mode == "synchronous" else learning.max_lag_episodes
+        return progress.episode - learner.episode > allowed
+
+    def _load(self, version: int, data: bytes) -> None:
+        """Take up a target network, if it is newer."""
+        if version > self._predictor.version:
+            self._predictor.load(version, data)
 
     def _publish_answer(self, observation: Observation) -> None:
         action = self.actor.act(observation)
@@ -263,7 +270,7 @@ class Session:
         if self._pending is not None:
             return "handing-over"
         learner = self._newest.state
-        if self._observation is not None and learner and learner.episode < progress.episode:
+        if self._observation is not None and learner and self._lags(progress, learner):
             return "training"
         return "filling" if progress.filling else "driving"
 
@@ -278,6 +285,7 @@ class ActorLoop:
         self._inbox: Inbox = me.bus.inbox()
         self._inbox.subscribe(OBSERVATION)
         self._inbox.subscribe(LEARNER_STATE, "main")
+        self._weights = WeightsFetcher(me, self._inbox.wake)
         me.stop.on_set(self._inbox.wake)
         self._next_beat_s = 0.0
 
@@ -304,7 +312,9 @@ class ActorLoop:
     def _session(self, robot: str) -> Session:
         if robot not in self._sessions:
             path = self._folder / f"{robot}.msgpack"
-            self._sessions[robot] = Session(self._me, robot, path, self._newest, self._numerics)
+            self._sessions[robot] = Session(
+                self._me, robot, path, self._newest, self._weights, self._numerics
+            )
             self._me.log.info("serving robot %r", robot)
         return self._sessions[robot]
 

@@ -134,13 +134,19 @@ class LearnerLoop:
     def _learn(self, turn: Turn) -> list[float]:
         """All mini-batches of this turn, answering requests in between. Raises Stopped."""
         losses = []
-        for trained in self._trainer.learn(self._mirror.samples, turn.episode):
-            losses.append(trained.loss)
-            self._trained = trained
-            self._activity = "fitting" if trained.batches else "training"
-            self._serve()
-            if self._me.stop.is_set():
-                raise Stopped("training")
+        try:
+            for trained in self._trainer.learn(self._mirror.samples, turn.episode):
+                losses.append(trained.loss)
+                self._trained = trained
+                self._activity = "fitting" if trained.batches else "training"
+                self._serve()
+                if self._me.stop.is_set():
+                    raise Stopped("training")
+        except FloatingPointError as error:
+            raise StateError(
+                f"episode {turn.episode}: {error}; the checkpoint {self._path} is of the episode "
+                f"before and intact: lower learning.learning_rate in a new run"
+            ) from error
         return losses
 
     def _record(self, turn: Turn, losses: list[float], seconds: float) -> None:

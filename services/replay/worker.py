@@ -18,9 +18,6 @@ import numpy as np
 from services.replay.numbering import Commit
 from services.replay.storage import Storage
 from services.replay.tables import Position
-from shared.bus import Inbox
-from shared.keys import LEARNER_STATE
-from shared.messages import LearnerState
 from shared.metrics import MetricsLog
 from shared.numerics import settle
 from shared.rl.descriptor import threshold_bits
@@ -28,7 +25,7 @@ from shared.rl.memory import ReplayMemory
 from shared.rl.predictor import Predictor
 from shared.rl.turn import Maintenance, maintain
 from shared.service import TICK_S, Service, Stopped
-from shared.weights import fetch
+from shared.weights import WeightsFetcher
 
 Activity = Literal["idle", "committing", "descriptors", "equalising", "discarding", "waiting"]
 COLUMNS = (
@@ -73,9 +70,7 @@ class TurnWorker(threading.Thread):
         self._config = me.config.memory
         self._wake = threading.Event()
         self._predictor = Predictor(me.config.network, settle(me.config, folder, "replay"))
-        self._inbox: Inbox = me.bus.inbox()
-        self._inbox.subscribe(LEARNER_STATE, "main")
-        self._newest_version = 0
+        self._weights = WeightsFetcher(me, lambda: None)
         self._metrics = MetricsLog(folder, "episodes", tuple(COLUMNS.split()))
         self._recent: deque[int] = deque(maxlen=100)
         self.failure: BaseException | None = None
@@ -141,18 +136,9 @@ class TurnWorker(threading.Thread):
 
     def _await_weights(self, least: int) -> None:
         """Have the newest target network, of version `least` or later. Raises Stopped."""
-
-        def newest() -> None:
-            version, data = fetch(self._me.bus)
-            if version > self._predictor.version:
-                self._predictor.load(version, data)
-
-        for _, state in self._inbox.take(LEARNER_STATE, LearnerState):
-            self._newest_version = max(self._newest_version, state.weights_version)
-        while self._predictor.version < max(least, self._newest_version):
-            self._me.insist("fetch weights", newest)
-            if self._predictor.version < least and self._me.stop.wait(0.02):
-                raise Stopped("waiting for weights")
+        version, data = self._weights.wait_for(least)
+        if version > self._predictor.version:
+            self._predictor.load(version, data)
 
     def _progress(self, activity: Activity) -> Callable[[int, int], None]:
         def report(done: int, of: int) -> None:

@@ -10,8 +10,8 @@ from cluster import ALL, Cluster, make_config
 from waiting import wait_until
 
 from services.replay.storage import Storage
-from shared.keys import OBSERVATION, ROBOT_COMMAND, ROBOT_STATE
-from shared.messages import Observation, RobotCommand, RobotState
+from shared.keys import ACTOR_STATE, OBSERVATION, ROBOT_COMMAND, ROBOT_STATE
+from shared.messages import ActorState, Observation, RobotCommand, RobotState
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
 REALTIME = {"timing": "realtime", "period_s": 0.1, "deadman_s": 0.2}
@@ -39,6 +39,31 @@ def test_asynchronous_learning_takes_up_weights_between_episodes(
         versions = [int(r["weights_version"]) for r in read_records(cluster)]  # type: ignore[call-overload]
     assert versions == sorted(versions)
     assert versions[-1] > 5
+
+
+def test_asynchronous_robot_waits_for_a_learner_too_far_behind(
+    run_name: str, tmp_path: Path
+) -> None:
+    lag = 3
+    config = make_config(run_name, learning={"mode": "asynchronous", "max_lag_episodes": lag})
+    with Cluster(config, tmp_path / "run") as cluster:
+        cluster.start(*ALL)
+        cluster.wait_episodes(3, 90)
+        cluster.freeze("learner")
+        inbox = cluster.bus.inbox()
+        inbox.subscribe(ACTOR_STATE)
+
+        def waits() -> bool:
+            return any(s.phase == "training" for _, s in inbox.take(ACTOR_STATE, ActorState))
+
+        cluster.wait(waits, 60, "the actor waits for the learner")
+        learner, replay = cluster.learner(), cluster.replay()
+        assert learner is not None
+        assert replay is not None
+        assert replay.episode - learner.episode == lag + 1
+        cluster.thaw("learner")
+        cluster.wait_episodes(replay.episode + 5, 60)
+        cluster.stop_all()
 
 
 def test_two_robots_learn_into_one_memory(run_name: str, tmp_path: Path) -> None:
