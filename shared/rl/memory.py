@@ -95,7 +95,7 @@ class SampleStore:
         self.rows = self.rows[keep]
 
     def ranks(self, ids: Ids) -> npt.NDArray[np.int64]:
-        """Positions of insertion numbers among the stored ones. Raises KeyError if one is missing."""
+        """Positions of insertion numbers among the stored. Raises KeyError if one is missing."""
         ranks = np.searchsorted(self.ids, ids)
         if np.any(ranks >= len(self)) or np.any(self.ids[np.minimum(ranks, len(self) - 1)] != ids):
             raise KeyError("insertion number not in memory")

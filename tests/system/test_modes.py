@@ -118,9 +118,7 @@ def late_looks(cluster: Cluster, count: int) -> list[Observation]:
 
     def enough() -> bool:
         inbox.wait(0.2)
-        looks.extend(
-            o for _, o in inbox.take(OBSERVATION, Observation) if o.interruption == "late"
-        )
+        looks.extend(o for _, o in inbox.take(OBSERVATION, Observation) if o.interruption == "late")
         return len(looks) >= count + 2
 
     wait_until(enough, 30, "late observations")
