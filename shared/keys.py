@@ -226,7 +226,7 @@ LEARNER_STATE = Stream(
     (),
     "learner",
     "actor, replay, monitor",
-    "1 Hz and at every turn done",
+    "1 Hz, 4 Hz while training, and at every turn done",
     4 * KIB,
     1,
     NEWEST,

@@ -427,7 +427,7 @@ class WeightsRequest(Message):
 
 
 class Weights(Message):
-    """One version of the target network. Learner's answer; at most 8 MB a part."""
+    """One version of the target network. Learner's answer; about 1 MB a part."""
 
     version: Count
     hash: Hash

@@ -50,11 +50,12 @@ class Feed(Tables):
                 yield _appended(number, last, rows, images)
             yield FeedEnd(change=number, rows=len(ids), messages=messages)
 
-    def mini_batch(self, ranks: npt.NDArray[np.int64]) -> Change:
-        """The samples at these ranks of insertion number, with current rewards."""
+    def mini_batch(self, size: int, draw: np.random.Generator) -> Change:
+        """At most `size` samples without replacement, drawn by rank, with current rewards."""
         with self._env.begin() as txn:
             number = Position(**self._meta(txn, "position")).change
             alive = self._alive(txn)
+            ranks = draw.choice(len(alive), size=min(size, len(alive)), replace=False)
             rows, images = self._rows(txn, sorted(alive[rank] for rank in ranks))
             self._overlay_rewards(txn, rows)
             return _appended(number, True, rows, images)

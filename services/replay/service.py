@@ -59,6 +59,7 @@ class Intake:
         self._inbox: Inbox = me.bus.inbox()
         self._bulk: Inbox = me.bus.inbox()
         self._worker = TurnWorker(me, storage, folder, self._inbox.wake)
+        self._bulk_failure: BaseException | None = None
         self._counters = storage.counters()
         self.duplicates = 0
         self.refused = 0
@@ -66,7 +67,7 @@ class Intake:
         me.stop.on_set(self._bulk.wake)
 
     def run(self) -> None:
-        """Serve until stopped. Raises what ended the turn worker, if something did."""
+        """Serve until stopped. Raises what ended one of the other threads, if something did."""
         for stream in (EPISODE, PROGRESS, TURNS):
             self._inbox.serve(stream)
         for stream in (CHANGES, SNAPSHOT, MINI_BATCH):
@@ -80,8 +81,9 @@ class Intake:
             self._me.stop.set("finished")
             self._worker.join(4.0)
             bulk.join(4.0)
-        if self._worker.failure is not None and not isinstance(self._worker.failure, Stopped):
-            raise self._worker.failure
+        for failure in (self._worker.failure, self._bulk_failure):
+            if failure is not None and not isinstance(failure, Stopped):
+                raise failure
 
     def _serve(self) -> None:
         next_beat_s, shown = 0.0, None
@@ -150,6 +152,14 @@ class Intake:
         )
 
     def _serve_bulk(self) -> None:
+        """The bulk thread; a failure ends the service, visibly."""
+        try:
+            self._stream_all()
+        except BaseException as error:  # noqa: BLE001  (raised again by the intake thread)
+            self._bulk_failure = error
+            self._me.stop.set(f"the bulk thread ended: {error!r}")
+
+    def _stream_all(self) -> None:
         while not self._me.stop.is_set():
             self._bulk.wait(TICK_S)
             for request in self._bulk.requests():
@@ -165,13 +175,8 @@ class Intake:
             for part in self._storage.snapshot():
                 request.reply(part)
         elif isinstance(message, MiniBatchRequest):
-            size = self._storage.size()
-            if not size:
-                request.refuse("the memory is empty")
-                return
             draw = generator(self._me.config.run.seed, "foreign mini-batch", message.key)
-            ranks = draw.choice(size, size=min(message.size, size), replace=False)
-            request.reply(self._storage.mini_batch(ranks))
+            request.reply(self._storage.mini_batch(message.size, draw))
 
 
 def _totals(counters: Counters) -> dict[str, int]:

@@ -7,9 +7,10 @@ sequence numbers, bumps, recovery and limits are decided here.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, Literal
 
-from services.robot_driver.recovery import back_off
+from services.robot_driver.recovery import Halted, WatchedRobot, back_off
 from services.robot_driver.robot import STANDSTILL, Pose, Robot, Velocity
 from services.robot_driver.safety import Safety
 from shared.config import Config
@@ -36,6 +37,8 @@ class Driver:
         self.life = life
         self.safety = Safety(config.robot)
         self.state: State = "waiting"
+        self.watch: Callable[[], None] = lambda: None
+        """Called while the robot recovers, so that commands take effect then too."""
         self.sequence = 0
         self.attempt = 0
         self.bumps = self.recoveries = self.late_actions = self.refused_actions = 0
@@ -210,6 +213,12 @@ class Driver:
         """Back off by real motion and turn to a random heading drawn from the seed (E11)."""
         self.state = "recovering"
         draw = generator(self._config.run.seed, "recovery", self._config.robot.id, self.sequence)
-        back_off(self._robot, self._config.robot, float(draw.uniform(-math.pi, math.pi)))
+        robot = WatchedRobot(
+            self._robot, self.safety, self.watch, SLICE_S if self._realtime else None
+        )
+        try:
+            back_off(robot, self._config.robot, float(draw.uniform(-math.pi, math.pi)))
+            self.recoveries += 1
+        except Halted:  # it stands where it was stopped; the operator's `clear` tells the actor
+            pass
         self._moving = False
-        self.recoveries += 1

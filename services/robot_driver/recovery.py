@@ -7,9 +7,53 @@ bumper has one bit for the whole ring: a pressed bumper cannot tell front from r
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from services.robot_driver.robot import STANDSTILL, Pose, Robot, Velocity
+from services.robot_driver.safety import Safety
 from shared.config import RobotConfig
+
+
+class Halted(Exception):
+    """An operator stopped the robot while it recovered."""
+
+
+class WatchedRobot:
+    """A robot during recovery: every command passes the limits, and an operator can stop it.
+
+    `watch` is called every `slice_s` while the robot moves; with None a motion is one piece, as
+    simulated time demands.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        safety: Safety,
+        watch: Callable[[], None],
+        slice_s: float | None,
+    ) -> None:
+        self._robot, self._safety = robot, safety
+        self._watch, self._slice_s = watch, slice_s
+        self.sense, self.now_s, self.close = robot.sense, robot.now_s, robot.close
+        self.state, self.restore = robot.state, robot.restore
+
+    def drive(self, velocity: Velocity) -> None:
+        """Drive what the limits leave of this velocity."""
+        self._robot.drive(self._safety.allow(velocity, self._robot.now_s()))
+
+    def run(self, duration_s: float, *, stop_on_contact: bool) -> bool:
+        """Let time pass, looking out for an operator. Raises Halted, standing still."""
+        contact = False
+        while duration_s > 0.0:
+            part_s = min(self._slice_s or duration_s, duration_s)
+            contact |= self._robot.run(part_s, stop_on_contact=stop_on_contact)
+            duration_s -= part_s
+            self._watch()
+            if self._safety.halted:
+                self._robot.drive(STANDSTILL)
+                raise Halted
+        return contact
+
 
 RELEASE_M = 0.05
 """Way driven regardless of the bumper, to let go of the wall that pressed it."""

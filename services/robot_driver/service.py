@@ -43,7 +43,7 @@ def run(config: Config, folder: Path) -> None:
         if saved is not None:
             _restore(driver, saved, path)
         with service("driver", config.robot.id, config, life=driver.life) as me:
-            loop = DriverLoop(me, driver)
+            loop = DriverLoop(me, driver, folder)
             try:
                 loop.run()
             finally:
@@ -66,7 +66,7 @@ def _restore(driver: Driver, saved: dict[str, object], path: Path) -> None:
 class DriverLoop:
     """Publishes observations and executes the actions that answer them."""
 
-    def __init__(self, me: Service, driver: Driver) -> None:
+    def __init__(self, me: Service, driver: Driver, folder: Path) -> None:
         self._me, self._driver, self._config = me, driver, me.config
         self._robot = me.config.robot.id
         self._inbox: Inbox = me.bus.inbox()
@@ -74,6 +74,9 @@ class DriverLoop:
         self._inbox.serve(ROBOT_COMMAND, self._robot)
         me.stop.on_set(self._inbox.wake)
         self._next_beat_s = 0.0
+        self._estop_mark = folder / "robot" / self._robot / "estop"
+        driver.safety.estop |= self._estop_mark.exists()
+        driver.watch = self.beat
 
     def run(self) -> None:
         """Turn after turn until the service is to stop."""
@@ -88,6 +91,7 @@ class DriverLoop:
             with request:
                 if isinstance(request.message, RobotCommand):
                     self._driver.command(request.message.command)
+                    self._remember_estop()
                     self._me.log.info("operator: %s", request.message.command)
                     request.reply(self._driver.report(self._inbox.refused_total))
                     force = True
@@ -96,6 +100,13 @@ class DriverLoop:
             self._next_beat_s = now_s + self._config.bus.heartbeat_s
             report = self._driver.report(self._inbox.refused_total)
             self._me.bus.publish(ROBOT_STATE, report, self._robot)
+
+    def _remember_estop(self) -> None:
+        """Keep the latch on disk before it is acknowledged: not even kill -9 releases it."""
+        if self._driver.safety.estop:
+            statefile.write_atomically(self._estop_mark, b"emergency stop: corridor clear\n")
+        else:
+            self._estop_mark.unlink(missing_ok=True)
 
     # ------------------------------------------------------------ lockstep
 

@@ -125,6 +125,13 @@ def late_looks(cluster: Cluster, count: int) -> list[Observation]:
     return looks[2:]  # the first may still show the motion that just ended
 
 
+def latched(cluster: Cluster) -> bool:
+    inbox = cluster.bus.inbox()
+    inbox.subscribe(ROBOT_STATE)
+    inbox.wait(1.0)
+    return any(s.state == "estop" for _, s in inbox.take(ROBOT_STATE, RobotState))
+
+
 def test_estop_latches_until_cleared_and_the_run_goes_on(run_name: str, tmp_path: Path) -> None:
     config = make_config(run_name)
     with Cluster(config, tmp_path / "run") as cluster:
@@ -144,6 +151,9 @@ def test_estop_latches_until_cleared_and_the_run_goes_on(run_name: str, tmp_path
         assert command("resume").state == "estop"
         assert command("pause").state == "estop"
         assert command("resume").sequence == stopped.sequence
+        cluster.kill("driver")
+        cluster.start("driver")
+        cluster.wait(lambda: latched(cluster), 30, "the restarted driver is stopped too")
         assert command("clear").state != "estop"
         before = cluster.learner()
         assert before is not None
