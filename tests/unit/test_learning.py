@@ -108,9 +108,9 @@ def test_training_uses_the_unclipped_output() -> None:
     store, trainer = make_store(8), make_trainer()
     with torch.no_grad():
         trainer.train_network.out.bias.fill_(5.0)
-    before = float(trainer.train_network.out.bias)
+    before = float(trainer.train_network.out.bias.detach())
     assert trainer.step(store, np.arange(8)) > 10.0
-    assert float(trainer.train_network.out.bias) < before
+    assert float(trainer.train_network.out.bias.detach()) < before
 
 
 def test_loss_falls_on_a_few_samples() -> None:

@@ -235,7 +235,7 @@ class MemoryMachine(RuleBasedStateMachine):
 
 TestMemoryMachine = MemoryMachine.TestCase
 TestMemoryMachine.settings = settings(
-    deadline=None, max_examples=40, stateful_step_count=25, derandomize=True
+    deadline=None, max_examples=150, stateful_step_count=40, derandomize=True
 )
 
 
