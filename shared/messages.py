@@ -263,7 +263,7 @@ class RobotProgress(Message):
     """Newest global episode number committed."""
     robot_life: str
     """Driver life of the robot's newest stored sample; empty if none."""
-    last_sequence: int
+    last_sequence: Annotated[int, Field(ge=-1, lt=2**63)]
     """Driver sequence of that sample; -1 if none."""
 
 
