@@ -1,0 +1,162 @@
+"""Checkpoints: everything comes back, and nothing that does not fit is taken."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from builders import fill_store
+from safetensors import safe_open
+from safetensors.torch import save
+
+from services.learner import checkpoint
+from shared.config import LearningConfig, NetworkConfig, Numerics
+from shared.errors import StateError
+from shared.rl.learning import Trainer
+from shared.rl.memory import SampleStore
+from shared.rl.network import to_bytes
+
+torch.set_num_threads(1)
+IDENTITY = "run1/0123456789abcdef"
+
+
+def make_trainer(filters: int = 4) -> Trainer:
+    learning = LearningConfig(batch_size=4, target_rule="bump")
+    return Trainer(NetworkConfig(filters=filters), learning, Numerics(batch=4), 1)
+
+
+def train(trainer: Trainer, episodes: range) -> None:
+    store = SampleStore()
+    fill_store(store, range(1, 9), [0, 1, 2] * 2 + [0, 1], np.linspace(-1, 1, 8).tolist())
+    for episode in episodes:
+        list(trainer.learn(store, episode))
+        trainer.apply_target_rule(episode, bump=episode % 2 == 0)
+
+
+def state(trainer: Trainer) -> tuple[bytes, bytes, dict[str, int]]:
+    return (
+        to_bytes(trainer.train_network),
+        to_bytes(trainer.target_network),
+        trainer.counters(),
+    )
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> tuple[Path, Trainer]:
+    path, trainer = tmp_path / "learner" / "checkpoint.safetensors", make_trainer()
+    train(trainer, range(1, 4))
+    checkpoint.write(path, trainer, 3, IDENTITY)
+    return path, trainer
+
+
+def test_a_restored_trainer_continues_bit_for_bit(written: tuple[Path, Trainer]) -> None:
+    path, trainer = written
+    resumed = make_trainer()
+    assert checkpoint.read(path, resumed, IDENTITY) == 3
+    assert state(resumed) == state(trainer)
+    train(trainer, range(4, 7))
+    train(resumed, range(4, 7))
+    assert state(resumed) == state(trainer)
+
+
+def test_an_untrained_trainer_can_be_saved_too(tmp_path: Path) -> None:
+    path, trainer = tmp_path / "checkpoint", make_trainer()
+    checkpoint.write(path, trainer, 0, IDENTITY)
+    resumed = make_trainer()
+    assert checkpoint.read(path, resumed, IDENTITY) == 0
+    train(trainer, range(1, 4))
+    train(resumed, range(1, 4))
+    assert state(resumed) == state(trainer)
+
+
+def test_without_a_file_the_trainer_stays_as_it_is(tmp_path: Path) -> None:
+    trainer = make_trainer()
+    before = state(trainer)
+    assert checkpoint.read(tmp_path / "none", trainer, IDENTITY) == 0
+    assert state(trainer) == before
+
+
+def test_the_newer_checkpoint_takes_the_place_of_the_older(written: tuple[Path, Trainer]) -> None:
+    path, trainer = written
+    train(trainer, range(4, 5))
+    checkpoint.write(path, trainer, 4, IDENTITY)
+    assert checkpoint.read(path, make_trainer(), IDENTITY) == 4
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+def test_a_half_written_newer_file_is_ignored(written: tuple[Path, Trainer]) -> None:
+    path, trainer = written
+    path.with_name(path.name + ".new").write_bytes(path.read_bytes()[:1000])
+    resumed = make_trainer()
+    assert checkpoint.read(path, resumed, IDENTITY) == 3
+    assert state(resumed) == state(trainer)
+    checkpoint.write(path, trainer, 4, IDENTITY)
+    assert checkpoint.read(path, make_trainer(), IDENTITY) == 4
+
+
+def test_a_checkpoint_of_another_run_is_refused(written: tuple[Path, Trainer]) -> None:
+    trainer = make_trainer()
+    before = state(trainer)
+    with pytest.raises(StateError, match="run2"):
+        checkpoint.read(written[0], trainer, "run2/0123456789abcdef")
+    assert state(trainer) == before
+
+
+def test_a_checkpoint_of_another_schema_is_refused(
+    written: tuple[Path, Trainer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checkpoint, "SCHEMA", 999)
+    with pytest.raises(StateError, match="999"):
+        checkpoint.read(written[0], make_trainer(), IDENTITY)
+
+
+def test_a_checkpoint_of_a_wider_network_is_refused(written: tuple[Path, Trainer]) -> None:
+    with pytest.raises(StateError, match="damaged checkpoint"):
+        checkpoint.read(written[0], make_trainer(filters=8), IDENTITY)
+
+
+@pytest.mark.parametrize("keep", [0, 1, 7, 8, 100, 5000, -1])
+def test_a_truncated_checkpoint_is_told_as_damaged(
+    written: tuple[Path, Trainer], keep: int
+) -> None:
+    path, _ = written
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(StateError, match="damaged checkpoint"):
+        checkpoint.read(path, make_trainer(), IDENTITY)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        None,
+        {},
+        {"state": "not json"},
+        {"state": "[1]"},
+        {"state": json.dumps({"schema": 1})},
+        {"state": json.dumps({"schema": 1, "identity": IDENTITY, "episode": 3})},
+        {"state": json.dumps({"schema": 1, "identity": IDENTITY, "episode": 3, "counters": {}})},
+    ],
+    ids=["none", "empty", "text", "list", "no identity", "no counters", "empty counters"],
+)
+def test_a_damaged_header_is_told_as_such(
+    written: tuple[Path, Trainer], header: dict[str, str] | None
+) -> None:
+    path, trainer = written
+    tensors = {name: t.contiguous() for name, t in trainer.tensors().items()}
+    path.write_bytes(save(tensors, header))
+    with pytest.raises(StateError, match="damaged checkpoint"):
+        checkpoint.read(path, make_trainer(), IDENTITY)
+
+
+@pytest.mark.parametrize("name", ["train.out.bias", "target.conv1.weight", "square_avg.out.bias"])
+def test_a_missing_tensor_is_told_by_its_name(written: tuple[Path, Trainer], name: str) -> None:
+    path, trainer = written
+    with safe_open(path, framework="pt") as file:
+        header = file.metadata()
+    tensors = {n: t.contiguous() for n, t in trainer.tensors().items() if n != name}
+    path.write_bytes(save(tensors, header))
+    with pytest.raises(StateError, match=name.replace(".", r"\.")):
+        checkpoint.read(path, make_trainer(), IDENTITY)
