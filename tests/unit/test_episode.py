@@ -10,7 +10,7 @@ import numpy as np
 import oracles
 import pytest
 from builders import LIFE, OTHER_LIFE, FakePredictor, fake_values, make_config, make_observation
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from services.actor.actor import Actor
@@ -423,9 +423,11 @@ def test_rewards_use_the_version_in_force_when_they_are_computed() -> None:
 
 @FAST
 @given(
-    events=st.lists(st.sampled_from(["go"] * 8 + ["bump", "late"]), min_size=1, max_size=60),
+    events=st.lists(st.sampled_from(["go"] * 4 + ["bump", "late"]), min_size=1, max_size=60),
     cut=st.integers(0, 59),
 )
+@example(events=["go", "go", "bump", "go", "go", "bump", "go"], cut=4)
+@example(events=["go"] * 16 + ["bump", "go", "late"], cut=14)
 def test_a_restored_actor_continues_as_if_nothing_had_happened(events: list[str], cut: int) -> None:
     runs = []
     for restart_at in (None, min(cut, len(events) - 1)):

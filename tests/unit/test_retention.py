@@ -106,7 +106,7 @@ class Bench:
 # ------------------------------------------------------------------------- counts
 
 
-def test_kept_counts_are_exact_where_floats_are_off_by_one() -> None:
+def test_kept_counts_are_exact_for_every_capacity() -> None:
     assert [normm_keep(n) for n in (45000, 100, 101, 2000, 50000, 90000)] == [
         44550, 99, 99, 1980, 49500, 89100,
     ]  # fmt: skip
