@@ -1,0 +1,116 @@
+"""P1: how much faster is one training step of 128 images than plain PyTorch?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from benchmarks import frames, plain
+from benchmarks.frame import (
+    Mode,
+    Times,
+    interleaved,
+    mode_of,
+    report,
+    rounds_of,
+    speedup,
+    times_table,
+)
+from benchmarks.frame import table as as_table
+from shared.config import Config, LearnerNumerics, LearningConfig, Numerics
+from shared.numerics import choose
+from shared.rl.learning import Trainer
+from shared.rl.network import QNetwork, load_bytes
+
+REQUIRED, AIM = 4.0, 6.0
+MINI_BATCH = 128
+PARTS = (8, 16, 32, 128)
+Ranks = npt.NDArray[np.int64]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    mode = mode_of(arguments, __doc__)
+    chosen = settled(mode)
+    cosines = gradient_cosines(mode)
+    times, tables = measure(mode, chosen)
+    rows = [[name, f"{value:.7f}"] for name, value in cosines.items()]
+    tables.append(as_table(["gradient against plain float32", "cosine"], rows))
+    bar = speedup("P1", times["plain"], times[label(chosen)], REQUIRED, AIM)
+    checks = {"gradient_cosine": cosines[chosen.precision], "threads": float(chosen.threads)}
+    report("P1 training step", tables, [replace(bar, checks=checks)])
+
+
+def settled(mode: Mode) -> Numerics:
+    """What the learner chooses here when threads and precision are left open."""
+    if mode == "check":
+        return LearnerNumerics()
+    config = Config(network=frames.network_config(mode))
+    return choose(config, LearnerNumerics(threads=0, precision="auto"), "learner")
+
+
+def label(numerics: Numerics) -> str:
+    return f"{numerics.precision}, parts of {numerics.batch}"
+
+
+def measure(mode: Mode, chosen: Numerics) -> tuple[Times, list[str]]:
+    """Times with as many threads as the learner chooses, and a table for each count of threads."""
+    rounds = rounds_of(mode, short=3, full=15)
+    tables, of_chosen = [], Times()
+    for threads in (1,) if mode == "check" else sorted({1, 2, chosen.threads}):
+        times = interleaved(cases(mode, threads), rounds)
+        tables.append(f"threads: {threads}\n\n{times_table(times, 'plain')}")
+        if threads == chosen.threads:
+            of_chosen = times
+    return of_chosen, tables
+
+
+def cases(mode: Mode, threads: int) -> dict[str, Callable[[], object]]:
+    """The plain step, and ours in both precisions and several part sizes."""
+    store, ranks = frames.samples(mode), mini_batch()
+    config, learning = frames.network_config(mode), LearningConfig()
+    weights = frames.trained_weights(mode)
+    naive = plain.Step(config, learning, weights, threads)
+    found: dict[str, Callable[[], object]] = {"plain": lambda: naive(store, ranks)}
+    for precision in ("float32", "bfloat16"):
+        for part in PARTS[1:2] if mode == "check" else PARTS:
+            numerics = LearnerNumerics(threads=threads, precision=precision, batch=part)
+            trainer = Trainer(config, learning, numerics, frames.SEED)
+            load_bytes(trainer.train_network, weights)
+            found[label(numerics)] = lambda t=trainer: t.step(store, ranks)
+    return found
+
+
+def gradient_cosines(mode: Mode) -> dict[str, float]:
+    """Cosine of the whole gradient on real frames with the plain step's, by precision."""
+    store, ranks = frames.samples(mode), mini_batch()
+    config, weights = frames.network_config(mode), frames.trained_weights(mode)
+    naive = plain.Step(config, LearningConfig(), weights, threads=1)
+    naive(store, ranks)
+    reference, cosines = gradient(naive.network), {}
+    for precision in ("float32", "bfloat16"):
+        trainer = Trainer(
+            config, LearningConfig(), LearnerNumerics(precision=precision), frames.SEED
+        )
+        load_bytes(trainer.train_network, weights)
+        trainer.step(store, ranks)
+        own = gradient(trainer.train_network)
+        cosines[precision] = float(own @ reference / (own.norm() * reference.norm()))
+    return cosines
+
+
+def mini_batch() -> Ranks:
+    return np.arange(MINI_BATCH, dtype=np.int64)
+
+
+def gradient(network: QNetwork) -> torch.Tensor:
+    """All gradients of the last step as one vector of float64."""
+    parts = [p.grad.flatten().double() for p in network.parameters() if p.grad is not None]
+    return torch.cat(parts)
+
+
+if __name__ == "__main__":
+    main()
