@@ -215,7 +215,7 @@ class Inbox:
         if len(pattern) != len(chunks):
             return None
         for expected, chunk in zip(pattern, chunks, strict=True):
-            if not IDENT.match(chunk):
+            if not IDENT.fullmatch(chunk):
                 return None
             if expected == "{id}":
                 return chunk

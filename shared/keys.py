@@ -48,7 +48,7 @@ class Stream:
     def key(self, run: str, ident: str = "") -> str:
         """The concrete key. Raises ValueError for a name that could widen the key."""
         for chunk in (run, *([ident] if "{id}" in self.pattern else [])):
-            if not IDENT.match(chunk):
+            if not IDENT.fullmatch(chunk):
                 raise ValueError(
                     f"key {self.pattern}: expected a name like {IDENT.pattern}, got {chunk!r}"
                 )

@@ -203,6 +203,8 @@ class Episode(Message):
             size = len(getattr(self, name))
             if size != n * width:
                 raise ValueError(f"{name}: expected {n} x {width} bytes, got {size}")
+        if self.bump != (self.ended == "bump"):
+            raise ValueError(f"bump is {self.bump}, but the episode ended {self.ended!r}")
         if max(self.sample_actions) > 2:
             raise ValueError(f"sample_actions: expected 0..2, got {max(self.sample_actions)}")
         if max(self.sample_worlds) >= len(self.worlds):

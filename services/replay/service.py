@@ -61,6 +61,7 @@ class Intake:
         self._worker = TurnWorker(me, storage, folder, self._inbox.wake)
         self._bulk_failure: BaseException | None = None
         self._counters = storage.counters()
+        self._version = max(1, storage.newest_weights_version())
         self.duplicates = 0
         self.refused = 0
         me.stop.on_set(self._inbox.wake)
@@ -100,11 +101,20 @@ class Intake:
     def _answer(self, request: Request) -> None:
         message = request.message
         if isinstance(message, Episode):
-            request.reply(self._commit(message))
+            if message.weights_version > self._known_version():
+                request.refuse(f"weights version {message.weights_version} is not known here yet")
+            else:
+                request.reply(self._commit(message))
         elif isinstance(message, ProgressRequest):
             request.reply(progress_of(self._counters, self._me.config.memory, message.robot))
         elif isinstance(message, TurnsRequest):
             request.reply(Turns(turns=self._storage.turns(message.since, message.limit)))
+
+    def _known_version(self) -> int:
+        """Newest weights version that exists: a turn would wait for ever for one that does not."""
+        newest, _ = self._worker.weights.newest
+        self._version = max(self._version, newest)
+        return self._version
 
     def _commit(self, episode: Episode) -> EpisodeAck:
         """Store one submission; when the answer goes out, it is on disk."""

@@ -118,6 +118,16 @@ class Tables:
         with self._env.begin() as txn:
             return Position(**self._meta(txn, "position"))
 
+    def worlds(self) -> list[str]:
+        """Names that the samples' world indices point into."""
+        with self._env.begin() as txn:
+            return list(self._meta(txn, "worlds"))
+
+    def newest_weights_version(self) -> int:
+        """Weights version of the newest commit; 0 without one."""
+        with self._env.begin() as txn, txn.cursor(self._db["commits"]) as cursor:
+            return int(unpack(cursor.value())["weights_version"]) if cursor.last() else 0
+
     def size(self) -> int:
         """Samples in memory at the newest turn."""
         with self._env.begin() as txn:

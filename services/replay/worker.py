@@ -70,7 +70,7 @@ class TurnWorker(threading.Thread):
         self._config = me.config.memory
         self._wake = threading.Event()
         self._predictor = Predictor(me.config.network, settle(me.config, folder, "replay"))
-        self._weights = WeightsFetcher(me, lambda: None)
+        self.weights = WeightsFetcher(me, lambda: None)
         self._metrics = MetricsLog(folder, "episodes", tuple(COLUMNS.split()))
         self._recent: deque[int] = deque(maxlen=100)
         self.failure: BaseException | None = None
@@ -112,6 +112,7 @@ class TurnWorker(threading.Thread):
             self._await_weights(int(record["weights_version"]))
         self._show(memory, activity="discarding")
         rows, images = self._storage.rows_of(commit)
+        memory.worlds = self._storage.worlds()
         memory.append(rows, images)
         done = maintain(
             memory,
@@ -136,7 +137,7 @@ class TurnWorker(threading.Thread):
 
     def _await_weights(self, least: int) -> None:
         """Have the newest target network, of version `least` or later. Raises Stopped."""
-        version, data = self._weights.wait_for(least)
+        version, data = self.weights.wait_for(least)
         if version > self._predictor.version:
             self._predictor.load(version, data)
 

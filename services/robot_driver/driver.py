@@ -191,11 +191,13 @@ class Driver:
 
     def restore(self, saved: dict[str, Any]) -> None:
         """Continue from `saved()`. Raises KeyError or ValueError when it does not fit."""
+        if saved.keys() != self.saved().keys():
+            odd = sorted(saved.keys() ^ self.saved().keys())
+            raise KeyError(f"missing or unknown: {', '.join(odd)}")
         self._robot.restore(saved["robot"])
         self.safety.estop = bool(saved["estop"])
-        for name, value in saved.items():
-            if name not in ("robot", "estop"):
-                setattr(self, name, type(getattr(self, name))(value))
+        for name in saved.keys() - {"robot", "estop"}:
+            setattr(self, name, type(getattr(self, name))(saved[name]))
 
     @property
     def _realtime(self) -> bool:

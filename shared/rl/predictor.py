@@ -1,8 +1,8 @@
 """Inference with fixed arithmetic: what a role predicts does not depend on who else asks.
 
 Images are processed in passes of exactly `numerics.batch`, the last one padded, so that the value
-of one image is the same bits whatever it is grouped with in number; threads, precision and batch
-are configuration (docs/architecture.md).
+of an image at one place of a pass is the same bits whoever shares the pass; threads, precision and
+batch are configuration (docs/architecture.md).
 """
 
 from __future__ import annotations

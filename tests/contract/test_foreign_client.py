@@ -62,6 +62,11 @@ class Client:
                 return answers
         raise AssertionError(f"nobody answers {key}")
 
+    def refusals(self, key: str, payload: bytes) -> list[str]:
+        """Error replies to one request."""
+        replies = self.session.get(f"{self.run}/{key}", payload=payload, timeout=10.0)
+        return [r.err.payload.to_string() for r in replies if r.err]
+
 
 @pytest.fixture
 def cluster(tmp_path: Path, run_name: str) -> Iterator[Cluster]:
@@ -157,7 +162,7 @@ def test_foreign_driver_is_driven_for_50_actions(cluster: Cluster, client: Clien
     assert progress["robot_life"] == LIFE
 
 
-def episode(number: int, *, count: int = 3, fill: bool = True) -> bytes:
+def episode(number: int, *, count: int = 3, fill: bool = True, version: int = 1) -> bytes:
     return pack(
         "Episode",
         robot="cube",
@@ -166,7 +171,7 @@ def episode(number: int, *, count: int = 3, fill: bool = True) -> bytes:
         fill=fill,
         ended="bump",
         bump=True,
-        weights_version=1,
+        weights_version=version,
         fitness=count,
         actions=count,
         dropped_samples=0,
@@ -198,6 +203,7 @@ def test_foreign_episode_is_acknowledged_once_however_often_sent(
     early = client.ask("replay/main/episode", episode(2, fill=False))[0]
     assert early["accepted"] is False
     assert "being filled" in early["reason"]
+    assert client.refusals("replay/main/episode", episode(3, version=99))
     cluster.kill("replay")
     cluster.start("replay")
     after = client.ask("replay/main/episode", episode(1))[0]

@@ -97,6 +97,7 @@ def episodes(draw: st.DrawFn) -> m.Episode:
         if f.annotation is not bytes and not name.startswith(("sample_", "worlds"))
     }
     fields["worlds"] = ("plus", "minus")
+    fields["bump"] = fields["ended"] == "bump"
     return make_episode(draw(st.integers(1, 3)), seed=draw(st.integers(0, 99)), **fields)
 
 
@@ -510,3 +511,12 @@ def test_the_largest_message_of_each_stream_fits_its_limit() -> None:
     assert (
         len(encode(make_observation(2**31, robot="a" * 41, world="a" * 41))) < limits[m.Observation]
     )
+
+
+@pytest.mark.parametrize(
+    ("ended", "bump"), [("bump", False), ("full", True), ("interrupted", True)]
+)
+def test_episode_that_contradicts_itself_about_its_end_is_refused(ended: str, bump: bool) -> None:
+    fields = {**make_episode(2).model_dump(), "ended": ended, "bump": bump}
+    with pytest.raises(ValueError, match="but the episode ended"):
+        m.Episode(**fields)

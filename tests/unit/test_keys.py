@@ -83,3 +83,8 @@ def test_liveliness_tokens_tell_who_lives() -> None:
 )
 def test_other_keys_are_no_liveliness_tokens(key: str) -> None:
     assert parse_alive(key) is None
+
+
+def test_name_with_a_trailing_line_break_is_refused() -> None:
+    with pytest.raises(ValueError, match="expected a name"):
+        OBSERVATION.key("run", "robot1\n")
