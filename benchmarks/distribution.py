@@ -1,0 +1,150 @@
+"""P5: what distribution costs: steps per second of the lock-step system over one process.
+
+Same robot, same full network, training off: the memory is so large that it is being filled all the
+time, so that every step renders, predicts and drives, and every episode is handed over and stored.
+The single-process loop and the system take turns.
+
+    python -m benchmarks.distribution [--short | --check]
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+
+from benchmarks.frame import Bar, Mode, mode_of, report, rounds_of, table
+from experiments.single_process import SingleProcess
+from services.monitor.supervisor import ChildSpec, Supervisor
+from services.monitor.up import STAGES, child_specs, free_endpoint
+from services.robot_driver.sim import SimRobot
+from services.robot_driver.world import load_world
+from shared import settings
+from shared.bus import Bus, Inbox
+from shared.config import ActorNumerics, Config, Numerics
+from shared.errors import RouterMissing
+from shared.keys import OBSERVATION
+from shared.messages import Observation
+from shared.numerics import choose
+
+WARM_UP_STEPS = 100
+PATIENCE_S = 600.0
+
+
+def configuration(filters: int = 64) -> Config:
+    """Filling for ever; the actor's arithmetic is what the demo would choose on this machine."""
+    base = Config.model_validate(
+        {
+            "run": {"name": "bench"},
+            "memory": {"capacity": 1_000_000},
+            "network": {"filters": filters},
+        }
+    )
+    chosen = choose(base, ActorNumerics(precision="auto"), "actor")
+    numerics = base.numerics.model_copy(update={"actor": chosen, "replay": Numerics(batch=1)})
+    return base.model_copy(update={"numerics": numerics})
+
+
+def single_process_rate(config: Config, steps: int) -> float:
+    """Steps per second of the single-process loop."""
+    robot = SimRobot(config.robot, load_world(config.robot.world), config.run.seed)
+    loop = SingleProcess(config, robot)
+    turns = loop.run()
+    while loop.actor.actions < WARM_UP_STEPS:
+        next(turns)
+    start_s, before = time.perf_counter(), loop.actor.actions
+    while loop.actor.actions - before < steps:
+        next(turns)
+    rate = (loop.actor.actions - before) / (time.perf_counter() - start_s)
+    robot.close()
+    return rate
+
+
+def system_rate(config: Config, steps: int, robots: int) -> float:
+    """Steps per second of router, four services and further drivers, all robots together."""
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place) / "run"
+        endpoint = free_endpoint()
+        bus = config.bus.model_copy(update={"endpoint": endpoint})
+        config = config.model_copy(update={"bus": bus})
+        stored = settings.claim(folder, config)
+        specs = child_specs(config, stored, folder, endpoint)
+        specs += [more_robots(specs, f"robotino{i}") for i in range(2, robots + 1)]
+        (folder / "logs").mkdir(exist_ok=True)
+        with Supervisor(specs, folder / "logs", dict(os.environ), []), connected(config) as client:
+            inbox = client.inbox()
+            inbox.subscribe(OBSERVATION)
+            return measured(inbox, steps, robots)
+
+
+def more_robots(specs: list[ChildSpec], robot: str) -> ChildSpec:
+    """A further simulated robot of the same run."""
+    driver = next(spec for spec in specs if spec.name == "driver")
+    command = (*driver.command, f"--set=robot.id={robot}")
+    return ChildSpec(f"driver-{robot}", command, STAGES["driver"])
+
+
+def connected(config: Config) -> Bus:
+    """A client of the run's router, as soon as it answers."""
+    deadline_s = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            return Bus(config.bus, config.run.name)
+        except RouterMissing:
+            if time.monotonic() > deadline_s:
+                raise
+
+
+def measured(inbox: Inbox, steps: int, robots: int) -> float:
+    """Executed actions of all robots per second, from the observations' numbers."""
+    newest: dict[str, int] = {}
+
+    def look() -> int:
+        inbox.wait(0.05)
+        for robot, seen in inbox.take(OBSERVATION, Observation):
+            newest[robot] = seen.sequence
+        return sum(newest.values())
+
+    deadline_s = time.monotonic() + PATIENCE_S
+    while len(newest) < robots or min(newest.values()) < WARM_UP_STEPS:
+        look()
+        if time.monotonic() > deadline_s:
+            raise TimeoutError(f"only {sorted(newest.items())} came to drive")
+    start_s, before = time.perf_counter(), look()
+    while (now := look()) - before < steps:
+        if time.monotonic() > deadline_s:
+            raise TimeoutError(f"{now - before} of {steps} steps within {PATIENCE_S:.0f} s")
+    return (now - before) / (time.perf_counter() - start_s)
+
+
+def measure(mode: Mode) -> tuple[list[list[object]], list[Bar]]:
+    """Rates of all cases in turns: rows for the table, and the bars P5a and P5b."""
+    steps = {"check": 50, "short": 2000, "full": 5000}[mode]
+    config = configuration(filters=4 if mode == "check" else 64)
+    robots = 2 if mode == "check" else 4
+    rates: dict[str, list[float]] = {"one process": [], "system, 1 robot": [], "system, n": []}
+    rounds = rounds_of(mode, 2, 3) if mode != "check" else 1
+    for _ in range(rounds):
+        rates["one process"].append(single_process_rate(config, steps))
+        rates["system, 1 robot"].append(system_rate(config, steps, 1))
+        rates["system, n"].append(system_rate(config, steps, robots))
+    single, one, many = (median(rates[name]) for name in rates)
+    bars = [
+        Bar("P5a", one / single, "x", "higher", 0.6, 0.85, single, one, rounds),
+        Bar("P5b", many / single, "x", "higher", 1.3, 1.8, single, many, rounds),
+    ]
+    named = [["one process", single], ["system, 1 robot", one], [f"system, {robots} robots", many]]
+    return [[name, rate, 1e3 / rate] for name, rate in named], bars
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure and report."""
+    rows, bars = measure(mode_of(arguments, __doc__))
+    report("Price of distribution", [table(["case", "steps/s", "ms a step"], rows)], bars)
+
+
+if __name__ == "__main__":
+    main()
