@@ -1,6 +1,6 @@
 """What a robot does after a bump (E11): retreat by real motion, then turn on the spot.
 
-It uses nothing but `drive`, `run` and `sense`, so it serves simulated and real robots alike. The
+It uses nothing but `drive`, `run` and `feel`, so it serves simulated and real robots alike. The
 bumper has one bit for the whole ring: a pressed bumper cannot tell front from rear.
 """
 
@@ -34,7 +34,8 @@ class WatchedRobot:
     ) -> None:
         self._robot, self._safety = robot, safety
         self._watch, self._slice_s = watch, slice_s
-        self.sense, self.now_s, self.close = robot.sense, robot.now_s, robot.close
+        self.sense, self.feel = robot.sense, robot.feel
+        self.now_s, self.close = robot.now_s, robot.close
         self.state, self.restore = robot.state, robot.restore
 
     def drive(self, velocity: Velocity) -> None:
@@ -71,12 +72,12 @@ def back_off(robot: Robot, config: RobotConfig, heading_rad: float) -> float:
     Raises:
         RobotFault: The robot cannot be read or commanded.
     """
-    start = robot.sense().pose
+    start = robot.feel().pose
     blocked = _move(robot, config, -config.recovery_distance_m)
-    here = robot.sense().pose
+    here = robot.feel().pose
     if blocked:
         _move(robot, config, _distance(start, here) / 2.0)
-        here = robot.sense().pose
+        here = robot.feel().pose
     turn = math.remainder(heading_rad - here.heading_rad, 2.0 * math.pi)
     robot.drive(Velocity(0.0, 0.0, math.copysign(config.turn_rad_s, turn)))
     robot.run(abs(turn) / config.turn_rad_s, stop_on_contact=False)
@@ -88,7 +89,7 @@ def _move(robot: Robot, config: RobotConfig, distance_m: float) -> bool:
     """Drive straight, backwards if negative; return whether a wall ended it."""
     left = abs(distance_m)
     speed = min(config.recovery_speed_m_s, config.max_speed_m_s)
-    pressed = robot.sense().contact
+    pressed = robot.feel().contact
     while left > 0.0:
         part = min(left, RELEASE_M) if pressed else left
         robot.drive(Velocity(math.copysign(speed, distance_m), 0.0, 0.0))
@@ -97,7 +98,7 @@ def _move(robot: Robot, config: RobotConfig, distance_m: float) -> bool:
         if bumped and not pressed:
             return True
         left -= part
-        pressed = pressed and robot.sense().contact
+        pressed = pressed and robot.feel().contact
     return pressed
 
 

@@ -39,13 +39,19 @@ STANDSTILL = Velocity(0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
-class Sensed:
-    """One reading of all sensors. image: uint8 [50, 75], preprocessed at the edge (A22)."""
+class Felt:
+    """One reading of odometry and bumper."""
 
-    image: ImageArray
     pose: Pose
     contact: bool
     """The ring bumper is pressed now."""
+
+
+@dataclass(frozen=True)
+class Sensed(Felt):
+    """One reading of all sensors. image: uint8 [50, 75], preprocessed at the edge (A22)."""
+
+    image: ImageArray
 
 
 class Robot(Protocol):
@@ -53,6 +59,9 @@ class Robot(Protocol):
 
     def sense(self) -> Sensed:
         """Read camera, odometry and bumper now. Raises RobotFault when a sensor cannot be read."""
+
+    def feel(self) -> Felt:
+        """Read odometry and bumper only: without the cost of a picture. Raises RobotFault."""
 
     def drive(self, velocity: Velocity) -> None:
         """Set the body velocity that holds until the next call. Raises RobotFault."""

@@ -188,7 +188,7 @@ class PacedRobot:
     def __init__(self, robot: SimRobot) -> None:
         self._robot = robot
         self._due_s = time.monotonic()
-        self.sense, self.drive = robot.sense, robot.drive
+        self.sense, self.feel, self.drive = robot.sense, robot.feel, robot.drive
         self.now_s, self.close = robot.now_s, robot.close
         self.state, self.restore = robot.state, robot.restore
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from services.robot_driver.robot import STANDSTILL, Pose, Sensed, Velocity
+from services.robot_driver.robot import STANDSTILL, Felt, Pose, Sensed, Velocity
 from services.robot_driver.scene import Scene
 from services.robot_driver.world import World
 from shared.config import RobotConfig
@@ -110,7 +110,11 @@ class SimRobot:
 
     def sense(self) -> Sensed:
         """Camera, pose and bumper now."""
-        return Sensed(preprocess(self.frame()), self._pose, self.contact)
+        return Sensed(self._pose, self.contact, preprocess(self.frame()))
+
+    def feel(self) -> Felt:
+        """Pose and bumper now, without a picture."""
+        return Felt(self._pose, self.contact)
 
     def drive(self, velocity: Velocity) -> None:
         """Set the body velocity that holds until the next call."""

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.robot_driver.driver import Driver, action_velocity
-from services.robot_driver.robot import STANDSTILL, Pose, Sensed, Velocity
+from services.robot_driver.robot import STANDSTILL, Felt, Pose, Sensed, Velocity
 from services.robot_driver.safety import Safety
 from shared.config import Config, RobotConfig
 from shared.messages import Action
@@ -33,7 +33,10 @@ class ScriptedRobot:
 
     def sense(self) -> Sensed:
         image = np.full((50, 75), int(self.time_s * 4) % 256, np.uint8)
-        return Sensed(image, Pose(self.x_m, 0.0, self.heading_rad), contact=False)
+        return Sensed(Pose(self.x_m, 0.0, self.heading_rad), False, image)
+
+    def feel(self) -> Felt:
+        return Felt(Pose(self.x_m, 0.0, self.heading_rad), contact=False)
 
     def drive(self, velocity: Velocity) -> None:
         self.velocity = velocity

@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 
 from services.robot_driver.recovery import Halted, WatchedRobot, back_off
-from services.robot_driver.robot import STANDSTILL, Pose, Sensed, Velocity
+from services.robot_driver.robot import STANDSTILL, Felt, Pose, Sensed, Velocity
 from services.robot_driver.safety import Safety
 from shared.config import RobotConfig
-from shared.messages import image_array
 
 
 class FreeRobot:
@@ -20,7 +19,10 @@ class FreeRobot:
         self.x_m = self.time_s = 0.0
 
     def sense(self) -> Sensed:
-        return Sensed(image_array(bytes(3750)), Pose(self.x_m, 0.0, 0.0), contact=False)
+        raise AssertionError("a recovery needs no picture")
+
+    def feel(self) -> Felt:
+        return Felt(Pose(self.x_m, 0.0, 0.0), contact=False)
 
     def drive(self, velocity: Velocity) -> None:
         self.velocity = velocity
