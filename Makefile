@@ -16,7 +16,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-full check lint unit system clean
+.PHONY: help setup demo test test-full check lint unit system bench bench-full clean
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
 
@@ -48,6 +48,12 @@ unit: $(VENV)/.dev ## fast tests, two at a time
 # Real processes wait for each other: one test at a time.
 system: $(VENV)/.dev ## tests with real processes and a real router, without the slow ones
 	$(PYTEST) -m "not slow" tests/system tests/learning
+
+bench: $(VENV)/.dev ## measure speed and memory, in minutes; the machine should do nothing else
+	$(BIN)/python -m benchmarks.run_all --short
+
+bench-full: $(VENV)/.dev ## the same with all images and rounds, in hours at most
+	$(BIN)/python -m benchmarks.run_all
 
 clean: ## remove the virtual environment and all caches; runs stay
 	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -19,7 +19,7 @@ from services.robot_driver.world import load_world
 from shared.config import Config, LearnerNumerics, LearningConfig, NetworkConfig
 from shared.rl.learning import Trainer
 from shared.rl.memory import MIRROR, SampleStore
-from shared.rl.network import to_bytes
+from shared.rl.network import initialised, to_bytes
 
 CACHE = Path(__file__).parent / ".cache"
 SEED = 1
@@ -38,7 +38,7 @@ class Sizes:
 
 SIZES: dict[Mode, Sizes] = {
     "check": Sizes(filters=4, frames=160, steps=2),
-    "short": Sizes(filters=64, frames=4000, steps=100),
+    "short": Sizes(filters=64, frames=4000, steps=60),
     "full": Sizes(filters=64, frames=45_000, steps=400),
 }
 
@@ -77,7 +77,8 @@ def trained_weights(mode: Mode) -> bytes:
     if path.exists():
         return path.read_bytes()
     store = samples(mode)
-    trainer = Trainer(network_config(mode), LearningConfig(), LearnerNumerics(), SEED)
+    numerics = LearnerNumerics(precision="bfloat16")
+    trainer = Trainer(network_config(mode), LearningConfig(), numerics, SEED)
     draw = np.random.default_rng(SEED)
     for _ in range(sizes.steps):
         trainer.step(store, draw.choice(len(store), min(128, len(store)), replace=False))
@@ -86,6 +87,11 @@ def trained_weights(mode: Mode) -> bytes:
         CACHE.mkdir(exist_ok=True)
         path.write_bytes(data)
     return data
+
+
+def untrained_weights(mode: Mode) -> bytes:
+    """The initial weights of a run, as safetensors bytes."""
+    return to_bytes(initialised(network_config(mode), SEED))
 
 
 def _driven(count: int) -> tuple[Images, npt.NDArray[np.uint8], npt.NDArray[np.float32]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -74,13 +75,13 @@ def cases(mode: Mode, threads: int) -> dict[str, Callable[[], object]]:
     config, learning = frames.network_config(mode), LearningConfig()
     weights = frames.trained_weights(mode)
     naive = plain.Step(config, learning, weights, threads)
-    found: dict[str, Callable[[], object]] = {"plain": lambda: naive(store, ranks)}
+    found: dict[str, Callable[[], object]] = {"plain": partial(naive, store, ranks)}
     for precision in ("float32", "bfloat16"):
         for part in PARTS[1:2] if mode == "check" else PARTS:
             numerics = LearnerNumerics(threads=threads, precision=precision, batch=part)
             trainer = Trainer(config, learning, numerics, frames.SEED)
             load_bytes(trainer.train_network, weights)
-            found[label(numerics)] = lambda t=trainer: t.step(store, ranks)
+            found[label(numerics)] = partial(trainer.step, store, ranks)
     return found
 
 
