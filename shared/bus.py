@@ -41,7 +41,12 @@ REPLY_LIMIT = 16 * 1024 * 1024
 
 
 def zenoh_config(
-    mode: str, *, connect: Sequence[str] = (), listen: Sequence[str] = (), lease_ms: int = 2000
+    mode: str,
+    *,
+    connect: Sequence[str] = (),
+    listen: Sequence[str] = (),
+    lease_ms: int = 2000,
+    shared_memory: bool = True,
 ) -> zenoh.Config:
     """A closed configuration: no scouting, explicit endpoints, quick reconnection."""
     config = zenoh.Config()
@@ -59,6 +64,7 @@ def zenoh_config(
             "period_increase_factor": 1.5,
         },
         "transport/link/tx/lease": lease_ms,
+        "transport/shared_memory/enabled": shared_memory,
         "adminspace/enabled": mode == "router",
     }.items():
         config.insert_json5(key, json.dumps(value))
@@ -232,7 +238,12 @@ class Bus:
         self._publishers: dict[str, zenoh.Publisher] = {}
         try:
             self._session = zenoh.open(
-                zenoh_config("client", connect=[config.endpoint], lease_ms=config.lease_ms)
+                zenoh_config(
+                    "client",
+                    connect=[config.endpoint],
+                    lease_ms=config.lease_ms,
+                    shared_memory=config.shared_memory,
+                )
             )
         except zenoh.ZError as error:
             raise RouterMissing(f"no Zenoh router at {config.endpoint}: {error}") from error

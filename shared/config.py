@@ -54,6 +54,8 @@ class BusConfig(Section):
     """A frozen or cut-off service counts as gone after this time."""
     request_timeout_s: float = Field(default=5.0, gt=0.0, le=120.0)
     """One attempt of a request; it is repeated until answered."""
+    shared_memory: bool = True
+    """Large messages between services of one machine go through shared memory where they can."""
     heartbeat_s: float = Field(default=1.0, gt=0.0, le=10.0)
     """Period of status messages; three missed ones count as silence."""
 
