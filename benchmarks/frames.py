@@ -6,6 +6,7 @@ Both are made once and kept in `benchmarks/.cache`, which may be deleted at any 
 from __future__ import annotations
 
 import functools
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,7 +39,7 @@ class Sizes:
 
 SIZES: dict[Mode, Sizes] = {
     "check": Sizes(filters=4, frames=160, steps=2),
-    "short": Sizes(filters=64, frames=4000, steps=60),
+    "short": Sizes(filters=64, frames=4000, steps=120),
     "full": Sizes(filters=64, frames=45_000, steps=400),
 }
 
@@ -77,7 +78,7 @@ def trained_weights(mode: Mode) -> bytes:
     if path.exists():
         return path.read_bytes()
     store = samples(mode)
-    numerics = LearnerNumerics(precision="bfloat16")
+    numerics = LearnerNumerics(precision="bfloat16", threads=min(2, len(os.sched_getaffinity(0))))
     trainer = Trainer(network_config(mode), LearningConfig(), numerics, SEED)
     draw = np.random.default_rng(SEED)
     for _ in range(sizes.steps):
