@@ -174,10 +174,12 @@ def forget_high_water() -> None:
 
 def episode_turn(mode: Mode) -> tuple[Bar, str]:
     """Append an episode to a full memory and discard as many, candidates being known."""
-    memory, config = full_memory(STORED[mode]), MemoryConfig(capacity=STORED[mode])
+    memory, config = ReplayMemory(STORED[mode]), MemoryConfig(capacity=STORED[mode])
+    memory.world_indices(["plus"])
     images = frames.images(mode, EPISODE)
     appends, discards, both = [], [], []
     for _ in range(rounds_of(mode, short=10, full=50)):
+        fill_up(memory)
         rows = next_rows(memory, EPISODE)
         start_s = time.perf_counter()
         memory.append(rows, images)
@@ -196,14 +198,10 @@ def episode_turn(mode: Mode) -> tuple[Bar, str]:
     return bar, table(head, cells)
 
 
-def full_memory(count: int) -> ReplayMemory:
-    """A memory filled to its capacity, half of it marked, with black images."""
-    memory = ReplayMemory(count)
-    memory.world_indices(["plus"])
-    for start in range(0, count, 4096):
-        size = min(4096, count - start)
-        memory.append(next_rows(memory, size), np.zeros((size, 50, 75), np.uint8))
-    return memory
+def fill_up(memory: ReplayMemory) -> None:
+    """Append black images up to the capacity, half of them marked."""
+    while missing := min(4096, memory.capacity - len(memory)):
+        memory.append(next_rows(memory, missing), np.zeros((missing, 50, 75), np.uint8))
 
 
 def next_rows(memory: ReplayMemory, count: int) -> npt.NDArray[np.void]:
