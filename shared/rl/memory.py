@@ -85,14 +85,14 @@ class SampleStore:
         added = rows.astype(self.rows.dtype, copy=True)
         added["slot"] = self._take_slots(len(rows))
         self._write(added["slot"], images)
-        self.rows = np.concatenate([self.rows, added])
+        self.rows = np.concatenate([_whole(self.rows), _whole(added)]).view(self.rows.dtype)
 
     def remove(self, ids: Ids) -> None:
         """Remove the samples with these insertion numbers. Raises KeyError if one is missing."""
         keep = np.ones(len(self), np.bool_)
         keep[self.ranks(ids)] = False
         self._free.extend(int(slot) for slot in self.rows["slot"][~keep][::-1])
-        self.rows = self.rows[keep]
+        self.rows = _whole(self.rows)[keep].view(self.rows.dtype)
 
     def ranks(self, ids: Ids) -> npt.NDArray[np.int64]:
         """Positions of insertion numbers among the stored. Raises KeyError if one is missing."""
@@ -152,6 +152,11 @@ class SampleStore:
         for block in np.unique(blocks):
             here = blocks == block
             self._blocks[block][places[here]] = images[here]
+
+
+def _whole(rows: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
+    """Rows as opaque records: numpy copies those some 20 times faster than field by field."""
+    return rows.view(np.dtype((np.void, rows.dtype.itemsize)))
 
 
 class ReplayMemory(SampleStore):

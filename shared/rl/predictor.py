@@ -47,7 +47,10 @@ def arithmetic(numerics: Numerics) -> Iterator[None]:
 def network_input(images: Images, device: str) -> Tensor:
     """uint8 [n, 50, 75] to float32 [n, 1, 50, 75] in [0, 1] (A22)."""
     tensor = torch.from_numpy(np.array(images)).to(device)  # received images are read-only
-    return tensor.unsqueeze(1).to(torch.float32).div_(255.0)
+    # One channel is laid out both ways at once; made last by its strides, the convolutions take it
+    # as it is instead of copying everything after the first of them.
+    channels_last = tensor.unsqueeze(-1).permute(0, 3, 1, 2)
+    return channels_last.to(torch.float32).div_(255.0)
 
 
 def feature_maps(network: QNetwork, images: Tensor, numerics: Numerics) -> Tensor:
