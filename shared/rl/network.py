@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -145,8 +144,3 @@ def weights_hash(data: bytes) -> str:
 def parameter_count(network: QNetwork) -> int:
     """Number of trained parameters: 1,238,337 at 64 filters."""
     return sum(p.numel() for p in network.parameters())
-
-
-def describe(config: NetworkConfig) -> str:
-    """The shape of the network in one line, for logs and error messages."""
-    return json.dumps({"filters": config.filters, "layout": config.layout})

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 from cluster import SERVICES, Cluster, make_config
-from waiting import wait_until
 
 from shared.keys import ACTION
 from shared.messages import Action
@@ -34,4 +33,3 @@ def test_first_action_comes_whatever_the_order(
 
 def test_orders_are_all_there_are() -> None:
     assert len(ORDERS) == 24
-    assert wait_until
