@@ -14,7 +14,11 @@ from shared.rl.descriptor import BITS
 Descriptors = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 ROWS = 512
-"""Rows compared at a time: bounds the memory to a few dozen megabytes."""
+"""Rows compared at a time."""
+NEWER = 8 * ROWS
+"""Newer rows they are compared with at a time: bounds the memory to a few dozen megabytes."""
+STEP = 64
+"""Rows are filled up to a multiple of it: the library keeps memory for every shape it has met."""
 
 
 def similar_to_newer(descriptors: Descriptors, bits: int, rule: Literal["paper", "cover"]) -> Mask:
@@ -50,29 +54,44 @@ def _any_newer(signs: Tensor, least_product: int) -> Mask:
         stop = min(start + ROWS, n)
         own = signs[start:stop] @ signs[start:stop].T >= least_product
         marked[start:stop] = own.triu(diagonal=1).any(dim=1).numpy()
-        for newer in range(stop, n, 8 * ROWS):
+        for newer in range(stop, n, NEWER):
             open_rows = start + np.flatnonzero(~marked[start:stop])
             if not len(open_rows):
                 break
-            rows = signs[torch.from_numpy(open_rows)]
-            products = rows @ signs[newer : newer + 8 * ROWS].T
-            marked[open_rows] = (products.amax(dim=1) >= least_product).numpy()
+            padded = np.resize(open_rows, _rounded_up(len(open_rows)))  # over again from the first
+            nearest = _largest_products(signs[torch.from_numpy(padded)], signs, newer, n)
+            marked[open_rows] = (nearest >= least_product)[: len(open_rows)]
     return marked
+
+
+def _largest_products(rows: Tensor, others: Tensor, start: int, end: int) -> npt.NDArray[np.int16]:
+    """The largest product of each row with others[start:start + NEWER], but not beyond `end`."""
+    products = rows @ others[start : min(start + NEWER, end)].T
+    return products.amax(dim=1).to(torch.int16).numpy()
+
+
+def _rounded_up(count: int) -> int:
+    return -(-count // STEP) * STEP
 
 
 def _uncovered(signs: Tensor, least_product: int) -> Mask:
     """From the newest to the oldest, keep a sample only if no kept newer one is similar."""
     n = len(signs)
     kept = np.zeros(n, np.bool_)
+    # Filled up with the newest sample, which is always kept: comparing with it again is harmless.
+    kept_signs, count = signs[-1:].repeat(_rounded_up(n), 1), 0
     for stop in range(n, 0, -ROWS):
         start = max(stop - ROWS, 0)
         block = signs[start:stop]
-        newer = signs[stop + torch.from_numpy(np.flatnonzero(kept[stop:]))]
         covered = np.zeros(len(block), np.bool_)
-        if len(newer):
-            covered |= ((block @ newer.T).amax(dim=1) >= least_product).numpy()
+        for other in range(0, count, NEWER):
+            nearest = _largest_products(block, kept_signs, other, _rounded_up(count))
+            covered |= nearest >= least_product
         own = (block @ block.T >= least_product).numpy()
         for row in range(len(block) - 1, -1, -1):
             inside = own[row, row + 1 :] & kept[start + row + 1 : stop]
             kept[start + row] = not (covered[row] or inside.any())
+        fresh = block[torch.from_numpy(kept[start:stop])]
+        kept_signs[count : count + len(fresh)] = fresh
+        count += len(fresh)
     return ~kept

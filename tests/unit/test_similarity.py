@@ -9,6 +9,7 @@ import oracles
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch import Tensor
 
 from shared.rl import similarity
 from shared.rl.similarity import similar_to_newer
@@ -41,13 +42,16 @@ def brute_force(given_descriptors: np.ndarray, bits: int, rule: Rule) -> list[bo
     rule=st.sampled_from(RULES),
     seed=st.integers(0, 10**6),
     rows=st.sampled_from([1, 2, 7, 512]),
+    newer=st.sampled_from([1, 5, 16, 4096]),
+    step=st.sampled_from([1, 4, 64]),
 )
 def test_marks_equal_brute_force_whatever_the_block_size(
-    n: int, flips: int, bits: int, rule: Rule, seed: int, rows: int
+    n: int, flips: int, bits: int, rule: Rule, seed: int, rows: int, newer: int, step: int
 ) -> None:
     given_descriptors = descriptors(n, flips, seed)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(similarity, "ROWS", rows)
+        for name, size in (("ROWS", rows), ("NEWER", newer), ("STEP", step)):
+            patch.setattr(similarity, name, size)
         found = similar_to_newer(given_descriptors, bits, rule)
     assert found.dtype == np.bool_
     assert list(found) == brute_force(given_descriptors, bits, rule)
@@ -70,6 +74,27 @@ def test_the_only_likeness_may_lie_blocks_away(rule: Rule) -> None:
     given_descriptors[-1] = given_descriptors[3]
     found = similar_to_newer(given_descriptors, 1, rule)
     assert list(np.flatnonzero(found)) == [3]
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_the_library_meets_few_shapes(rule: Rule) -> None:
+    """It keeps memory for each shape of a product it has met."""
+    rng = np.random.default_rng(3)
+    patterns = rng.integers(0, 256, (500, 15), np.uint8)
+    flips = np.packbits(rng.random((similarity.ROWS * 20, 120)) < 0.02, axis=1)
+    given_descriptors = patterns[rng.integers(0, len(patterns), len(flips))] ^ flips
+    shapes: set[tuple[int, ...]] = set()
+    products = similarity._largest_products
+
+    def noted(rows: Tensor, others: Tensor, start: int, end: int) -> np.ndarray:
+        shapes.add((len(rows), min(similarity.NEWER, end - start)))
+        return products(rows, others, start, end)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(similarity, "_largest_products", noted)
+        marked = similar_to_newer(given_descriptors, 2, rule)
+    assert 0.1 < marked.mean() < 0.9
+    assert all(rows % similarity.STEP == 0 == others % similarity.STEP for rows, others in shapes)
 
 
 @pytest.mark.parametrize("rule", RULES)
