@@ -1,6 +1,6 @@
 """Run the benchmarks one after the other and write what they found.
 
-    python -m benchmarks.run_all --short               all, in minutes
+    python -m benchmarks.run_all --short               all but the long ones, in minutes
     python -m benchmarks.run_all training_step         this one; other results stay as they are
 
 Writes results.json and results.md beside this file and renews the table in docs/performance.md.
@@ -39,11 +39,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in given.names:
         if name not in known:
             parser.error(f"no benchmark {name!r}, there are: {', '.join(known)}")
+    chosen = [name for name in given.names or known if not (given.short and is_long(name))]
     entries = stored(RESULTS)
-    for name in given.names or known:
+    for name in chosen:
         entries[name] = run(name, short=given.short)
         write({name: entries[name] for name in known if name in entries})
-    failed = [name for name in given.names or known if entries[name]["error"]]
+    failed = [name for name in chosen if entries[name]["error"]]
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
     return bool(failed)
@@ -58,6 +59,11 @@ def scripts() -> list[str]:
         if number and "\ndef main(" in text:
             found.append((int(number[1]), path.stem))
     return [name for _, name in sorted(found)]
+
+
+def is_long(name: str) -> bool:
+    """Whether a script says that it has no short mode; what it found before is kept then."""
+    return "\nLONG = True\n" in (HERE / f"{name}.py").read_text()
 
 
 def run(name: str, *, short: bool) -> Entry:

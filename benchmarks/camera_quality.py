@@ -1,0 +1,287 @@
+"""P6: what the camera's quality means for learning: bumps of policies learnt at two sizes.
+
+The simulator renders at 75x50, cheap and aliased, or at 150x100, reduced to 75x50 by area. For each
+of three seeds and either size a narrow network learns in the single-process loop for the same
+number of actions; then it drives greedily, without learning, from the same starts, at the size it
+has learnt at. Runs take minutes each: they are stored one by one, and a later call goes on.
+
+    python -m benchmarks.camera_quality [--jobs 2 | --check]
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import multiprocessing
+import os
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+from benchmarks import driving
+from benchmarks.driving import Figures
+from benchmarks.frame import Bar, commit, report, table
+from experiments.single_process import SingleProcess
+from services.robot_driver.sim import SimRobot
+from services.robot_driver.world import load_world
+from shared.config import Config
+
+LONG = True
+"""Too long for short measuring: the stored results stay as they are then."""
+CACHE = Path(__file__).parent / ".cache"
+HEIGHTS = {75: 50, 150: 100}
+"""Height rendered by width; the first is the configured default."""
+FITNESS_OF_LAST = 100
+"""Episodes, as everywhere fitness is shown."""
+Run = dict[str, Any]
+"""What one learning run gave: settings, commit, seconds, learning, driving."""
+DRIVING = {
+    "bumps_per_1000": "bumps per 1000",
+    "mean_run": "mean run",
+    "longest_run": "longest run",
+    "distance": "distance",
+    "laps_left": "laps left",
+    "laps_right": "laps right",
+}
+"""Figures of the frozen policy, and their heads."""
+LEARNING = {
+    "bumps": "bumps, learning",
+    "fitness": "fitness, learning",
+    "laps_left": "laps left, learning",
+    "laps_right": "laps right, learning",
+    "episodes": "episodes",
+}
+"""Figures of learning, after the memory was full."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How much of everything: equal for all runs."""
+
+    seeds: tuple[int, ...] = (1, 2, 3)
+    filters: int = 16
+    capacity: int = 3000
+    fit_every: int = 25
+    mini_batches: int = 4
+    actions: int = 30_000
+    """Learnt from after the memory is full; the episode that reaches it ends first."""
+    starts: int = 40
+    drive_actions: int = 400
+    """Actions driven from each start without learning."""
+
+
+CHECK = Plan((1, 2), 4, 90, fit_every=5, mini_batches=1, actions=150, starts=2, drive_actions=80)
+
+
+def config_of(plan: Plan, seed: int, width: int) -> Config:
+    """The configuration of a run: the demo's way of learning, a narrower network."""
+    camera = {"render_width_px": width, "render_height_px": HEIGHTS[width]}
+    return Config.model_validate(
+        {
+            "run": {"seed": seed},
+            "robot": {"camera": camera},
+            "network": {"filters": plan.filters},
+            "memory": {"capacity": plan.capacity},
+            "learning": {
+                "fit_every": plan.fit_every,
+                "mini_batches_per_episode": plan.mini_batches,
+            },
+        }
+    )
+
+
+def settings_of(plan: Plan, seed: int, width: int) -> dict[str, Any]:
+    """Everything that decides what a run gives."""
+    names = ("actions", "starts", "drive_actions")
+    return {
+        "seed": seed,
+        "width": width,
+        "configuration": config_of(plan, seed, width).fingerprint(),
+        "evaluation": [driving.SEED, driving.ROOM_M, driving.JITTER_RAD],
+        **{name: getattr(plan, name) for name in names},
+    }
+
+
+def path_of(settings: dict[str, Any], folder: Path) -> Path:
+    """Where a run with these settings is stored."""
+    text = json.dumps(settings, sort_keys=True)
+    key = hashlib.sha256(text.encode()).hexdigest()[:12]
+    return folder / f"quality-{settings['width']}-{settings['seed']}-{key}.json"
+
+
+def learnt(plan: Plan, seed: int, width: int, folder: Path) -> Run:
+    """One run: learn, then drive with the last weights. Stored when it is over."""
+    start_s = time.perf_counter()
+    config = config_of(plan, seed, width)
+    robot = SimRobot(config.robot, load_world(config.robot.world), seed)
+    try:
+        loop = SingleProcess(config, robot)
+        learning = learn(loop, plan.actions)
+        driven = drive(plan, config, robot, driving.greedy(loop.acting))
+    finally:
+        robot.close()
+    run: Run = {
+        "settings": settings_of(plan, seed, width),
+        "commit": commit(),
+        "seconds": round(time.perf_counter() - start_s, 1),
+        "learning": learning,
+        "driving": driven,
+    }
+    store(run, folder)
+    return run
+
+
+def learn(loop: SingleProcess, actions: int) -> Figures:
+    """Let the loop learn from so many actions; what it was like while learning."""
+    fitness: list[int] = []
+    for done in loop.run():
+        if done.commit.episode:
+            fitness.append(done.submitted.fitness)
+        if loop.counters.actions >= actions:
+            break
+    counters = loop.counters
+    return {
+        "bumps": counters.bumps,
+        "fitness": mean(fitness[-FITNESS_OF_LAST:]),
+        "laps_left": counters.laps_left,
+        "laps_right": counters.laps_right,
+        "episodes": counters.episode,
+        "actions": counters.actions,
+    }
+
+
+def drive(plan: Plan, config: Config, robot: SimRobot, chooser: driving.Chooser) -> Figures:
+    """Figures of all drives without learning."""
+    traces = driving.drives(config, robot, chooser, plan.starts, plan.drive_actions)
+    return driving.figures(traces, config.episode.horizon, config.max_distance_m)
+
+
+def floor(plan: Plan) -> Figures:
+    """Figures of random actions on the same drives."""
+    config = config_of(plan, plan.seeds[0], min(HEIGHTS))
+    robot = SimRobot(config.robot, load_world(config.robot.world), 0)
+    try:
+        return drive(plan, config, robot, driving.uniform)
+    finally:
+        robot.close()
+
+
+def store(run: Run, folder: Path) -> None:
+    """Keep a finished run; a half written file never bears its name."""
+    folder.mkdir(exist_ok=True)
+    path = path_of(run["settings"], folder)
+    part = path.with_suffix(f".{os.getpid()}.part")
+    part.write_text(json.dumps(run, indent=1) + "\n")
+    part.replace(path)
+
+
+def stored(settings: dict[str, Any], folder: Path) -> Run | None:
+    """The stored run of these settings, if there is one."""
+    path = path_of(settings, folder)
+    return dict(json.loads(path.read_text())) if path.exists() else None
+
+
+def all_runs(plan: Plan, folder: Path, jobs: int) -> list[Run]:
+    """All runs, by size and seed; those not stored yet are made."""
+    wanted = [(plan, seed, width, folder) for seed in plan.seeds for width in HEIGHTS]
+    missing = [each for each in wanted if stored(settings_of(*each[:3]), folder) is None]
+    for run in made(missing, jobs):
+        print(f"{name_of(run)}: {run['seconds']:.0f} s, {run['driving']}", flush=True)
+    keys = [settings_of(plan, seed, width) for width in HEIGHTS for seed in plan.seeds]
+    return [found for key in keys if (found := stored(key, folder)) is not None]
+
+
+def made(missing: Sequence[tuple[Plan, int, int, Path]], jobs: int) -> Iterator[Run]:
+    """Make runs, each in a process of its own unless only one is to run at a time."""
+    if jobs == 1:
+        yield from (learnt(*each) for each in missing)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, context, max_tasks_per_child=1) as pool:
+        futures = [pool.submit(learnt, *each) for each in missing]
+        yield from (future.result() for future in as_completed(futures))
+
+
+def name_of(run: Run) -> str:
+    """The size a run rendered at, as it is written."""
+    width = run["settings"]["width"]
+    return f"{width}x{HEIGHTS[width]}"
+
+
+def runs_table(runs: Sequence[Run], random: Figures) -> str:
+    """One row for each run, and one for the random policy."""
+    head = ["camera", "seed", *DRIVING.values(), *LEARNING.values(), "s"]
+    rows: list[list[object]] = [
+        [
+            name_of(run),
+            run["settings"]["seed"],
+            *(run["driving"][name] for name in DRIVING),
+            *(run["learning"][name] for name in LEARNING),
+            run["seconds"],
+        ]
+        for run in runs
+    ]
+    blank = [None] * (len(LEARNING) + 1)
+    rows.append(["random", None, *(random[name] for name in DRIVING), *blank])
+    return table(head, rows)
+
+
+def summary_table(runs: Sequence[Run]) -> str:
+    """Each figure's mean with its span at either size, and the difference of the means."""
+    sizes = list(dict.fromkeys(map(name_of, runs)))
+    rows: list[list[object]] = []
+    heads = {("driving", name): text for name, text in DRIVING.items()}
+    heads |= {("learning", name): text for name, text in LEARNING.items()}
+    for (part, name), text in heads.items():
+        means, cells = [], []
+        for size in sizes:
+            values = [run[part][name] for run in runs if name_of(run) == size]
+            means.append(mean(values))
+            cells.append(f"{means[-1]:.3g} ({min(values):.3g}..{max(values):.3g})")
+        rows.append([text, *cells, means[0] - means[1]])
+    return table(["mean (span)", *sizes, "difference"], rows)
+
+
+def bar(runs: Sequence[Run], random: Figures) -> Bar:
+    """P6c: bumps at the default size by those at the larger one."""
+    checks: dict[str, float] = {}
+    rates = []
+    for width in HEIGHTS:
+        driven = [run["driving"] for run in runs if run["settings"]["width"] == width]
+        rates.append(mean(figures["bumps_per_1000"] for figures in driven))
+        checks[f"bumps_per_1000_{width}"] = rates[-1]
+        checks[f"distance_{width}"] = mean(figures["distance"] for figures in driven)
+        laps = [figures["laps_left"] + figures["laps_right"] for figures in driven]
+        checks[f"laps_{width}"] = mean(laps)
+    checks["bumps_per_1000_random"] = random["bumps_per_1000"]
+    # Without a single bump a ratio means nothing: at least one in all drives of a size.
+    least = 1000.0 / sum(figures["actions"] for figures in driven)
+    ours, baseline = (max(rate, least) for rate in rates)
+    unit = "x bumps of 150x100"
+    n = len(runs) // len(HEIGHTS)
+    return Bar("P6c", ours / baseline, unit, "lower", 1.25, 1.0, baseline, ours, n, checks)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Make what is missing and report."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    cores = len(os.sched_getaffinity(0))
+    parser.add_argument("--jobs", type=int, default=min(2, cores), help="runs at a time")
+    parser.add_argument("--check", action="store_true", help="tiny: does it run at all")
+    given = parser.parse_args(arguments)
+    plan = CHECK if given.check else Plan()
+    with tempfile.TemporaryDirectory() as nowhere:
+        folder, jobs = (Path(nowhere), 1) if given.check else (CACHE, given.jobs)
+        runs = all_runs(plan, folder, jobs)
+    random = floor(plan)
+    report("Camera quality", [runs_table(runs, random), summary_table(runs)], [bar(runs, random)])
+
+
+if __name__ == "__main__":
+    main()
