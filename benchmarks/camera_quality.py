@@ -249,7 +249,11 @@ def summary_table(runs: Sequence[Run]) -> str:
 
 
 def bar(runs: Sequence[Run], random: Figures) -> Bar:
-    """P6c: bumps at the default size by those at the larger one."""
+    """P6c: bumps at the default size by those at the larger one.
+
+    Runs that get less far than random actions have learnt to circle, not to drive: few bumps are
+    no success then, so they are counted as nowhere.
+    """
     checks: dict[str, float] = {}
     rates = []
     for width in HEIGHTS:
@@ -259,6 +263,7 @@ def bar(runs: Sequence[Run], random: Figures) -> Bar:
         checks[f"distance_{width}"] = mean(figures["distance"] for figures in driven)
         laps = [figures["laps_left"] + figures["laps_right"] for figures in driven]
         checks[f"laps_{width}"] = mean(laps)
+        checks[f"nowhere_{width}"] = sum(each["distance"] < random["distance"] for each in driven)
     checks["bumps_per_1000_random"] = random["bumps_per_1000"]
     # Without a single bump a ratio means nothing: at least one in all drives of a size.
     least = 1000.0 / sum(figures["actions"] for figures in driven)

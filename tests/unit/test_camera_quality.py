@@ -34,7 +34,8 @@ def test_last_line_of_the_script_is_its_bar(capsys: pytest.CaptureFixture[str]) 
     assert [bar["id"] for bar in bars] == ["P6c"]
     assert bars[0]["n"] == len(CHECK.seeds)
     assert (bars[0]["better"], bars[0]["required"], bars[0]["aim"]) == ("lower", 1.25, 1.0)
-    names = {f"{name}_{w}" for name in ("bumps_per_1000", "distance", "laps") for w in (75, 150)}
+    parts = ("bumps_per_1000", "distance", "laps", "nowhere")
+    names = {f"{part}_{width}" for part in parts for width in (75, 150)}
     assert bars[0]["checks"].keys() == names | {"bumps_per_1000_random"}
 
 
@@ -128,19 +129,27 @@ def test_a_run_is_stored_as_it_is(tmp_path: Path) -> None:
     assert run["driving"]["actions"] == TINY.drive_actions
 
 
-def test_no_bumps_at_all_still_give_a_ratio() -> None:
-    def run(width: int, bumps: int) -> dict[str, Any]:
-        driven = {
-            "actions": 1000, "bumps": bumps, "bumps_per_1000": float(bumps),
-            "distance": 0.5, "laps_left": 1, "laps_right": 2,
-        }  # fmt: skip
-        return {"settings": {"width": width}, "driving": driven}
+def made_up_run(width: int, bumps: int, distance: float = 0.5) -> dict[str, Any]:
+    driven = {
+        "actions": 1000, "bumps": bumps, "bumps_per_1000": float(bumps),
+        "distance": distance, "laps_left": 1, "laps_right": 2,
+    }  # fmt: skip
+    return {"settings": {"width": width}, "driving": driven}
 
-    random = {"bumps_per_1000": 80.0}
-    runs = [run(75, 0), run(75, 0), run(150, 0), run(150, 0)]
-    assert camera_quality.bar(runs, random).value == 1.0
-    runs = [run(75, 3), run(75, 0), run(150, 0), run(150, 0)]
-    assert camera_quality.bar(runs, random).value == pytest.approx(3.0)
+
+RANDOM = {"bumps_per_1000": 80.0, "distance": 0.3}
+
+
+@pytest.mark.parametrize(("bumps", "ratio"), [((0, 0, 0, 0), 1.0), ((3, 0, 0, 0), 3.0)])
+def test_no_bumps_at_all_still_give_a_ratio(bumps: tuple[int, ...], ratio: float) -> None:
+    runs = [made_up_run(*each) for each in zip((75, 75, 150, 150), bumps, strict=True)]
+    assert camera_quality.bar(runs, RANDOM).value == pytest.approx(ratio)
+
+
+def test_runs_that_only_circle_are_told_apart() -> None:
+    runs = [made_up_run(75, 4, 0.12), made_up_run(75, 4), made_up_run(150, 4)]
+    checks = camera_quality.bar(runs, RANDOM).checks
+    assert (checks["nowhere_75"], checks["nowhere_150"]) == (1, 0)
 
 
 def test_short_measuring_leaves_long_scripts_out_and_keeps_what_they_found(
