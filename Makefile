@@ -3,25 +3,26 @@
 #   make demo       install, then watch a simulated robot learn; Ctrl-C stops, again continues
 #   make test       install, then all checks and tests but the slow ones
 #
-# Variables: PYTHON (python3.11), ARGS (more options for `corridor up` in demo), and
-# TORCH_INDEX_URL: one of PyTorch's own package indexes, to choose a CPU-only or a CUDA build.
+# Variables: PYTHON (python3.11), ARGS (more options: for `corridor up` in demo, of bench-peers),
+# and TORCH_INDEX_URL: one of PyTorch's own package indexes, to choose a CPU-only or a CUDA build.
 
 PYTHON ?= python3.11
 TORCH_INDEX_URL ?=
 ARGS ?=
 VENV := .venv
+PEERS := .venv-peers
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 # Tests run beside each other: more than one thread each would only get in the way.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-full check lint unit system bench bench-full clean
+.PHONY: help setup demo test test-full check lint unit system bench bench-full bench-peers clean
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
 
 help: ## show this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 setup: $(VENV)/.dev ## make the virtual environment with everything in it
 
@@ -55,8 +56,11 @@ bench: $(VENV)/.dev ## measure speed and memory, in minutes; the machine should 
 bench-full: $(VENV)/.dev ## the same with all images and rounds, in hours at most
 	$(BIN)/python -m benchmarks.run_all
 
-clean: ## remove the virtual environment and all caches; runs stay
-	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+bench-peers: $(PEERS)/.peers ## measure what other projects offer beside ours; installs them apart
+	$(PEERS)/bin/python -m benchmarks.run_all $(ARGS) peer_learning peer_replay peer_transport
+
+clean: ## remove the virtual environments and all caches; runs stay
+	rm -rf $(VENV) $(PEERS) build *.egg-info .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find shared services experiments benchmarks tests -name __pycache__ -prune -exec rm -rf {} +
 
 # ---------------------------------------------------------------- the virtual environment
@@ -82,4 +86,11 @@ $(VENV)/.made:
 	  { echo "missing: the venv and ensurepip modules of $(PYTHON); on Debian install python3.11-venv" >&2; exit 1; }
 	@$(PYTHON) -m venv --clear $(VENV)
 	@$(PIP) --version >/dev/null || { echo "missing: pip in $(VENV)" >&2; exit 1; }
+	@touch $@
+
+# The same installation in a place of its own: what other projects need stays out of ours.
+$(PEERS)/.peers: benchmarks/requirements-peers.txt pyproject.toml constraints.txt
+	$(MAKE) VENV=$(PEERS) $(PEERS)/.all
+	$(PEERS)/bin/python -m pip --disable-pip-version-check install --constraint constraints.txt \
+	  --requirement benchmarks/requirements-peers.txt
 	@touch $@

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.frame import ROOT, Bar, bar_row, from_json, machine, table
+from benchmarks.peers import NOT_INSTALLED
 
 HERE = Path(__file__).parent
 RESULTS, PAGE = HERE / "results.json", ROOT / "docs" / "performance.md"
@@ -41,10 +42,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parser.error(f"no benchmark {name!r}, there are: {', '.join(known)}")
     chosen = [name for name in given.names or known if not (given.short and is_long(name))]
     entries = stored(RESULTS)
+    failed = []
     for name in chosen:
-        entries[name] = run(name, short=given.short)
+        entry = run(name, short=given.short)
+        if entry is None:
+            continue
+        entries[name] = entry
         write({name: entries[name] for name in known if name in entries})
-    failed = [name for name in chosen if entries[name]["error"]]
+        failed += [name] if entry["error"] else []
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
     return bool(failed)
@@ -66,8 +71,11 @@ def is_long(name: str) -> bool:
     return "\nLONG = True\n" in (HERE / f"{name}.py").read_text()
 
 
-def run(name: str, *, short: bool) -> Entry:
-    """Run one script in a process of its own, showing what it prints."""
+def run(name: str, *, short: bool) -> Entry | None:
+    """Run one script in a process of its own, showing what it prints.
+
+    None when it says that what it compares with is not installed: what it found before is kept.
+    """
     words = ["-m", f"benchmarks.{name}", *(["--short"] if short else [])]
     entry: Entry = {
         "command": " ".join(["python", *words]),
@@ -84,6 +92,8 @@ def run(name: str, *, short: bool) -> Entry:
         for line in process.stdout:
             print(line, end="", flush=True)
             lines.append(line)
+    if process.returncode == NOT_INSTALLED:
+        return None
     entry["seconds"] = round(time.perf_counter() - start_s, 1)
     entry["error"] = f"exit code {process.returncode}" if process.returncode else ""
     entry["bars"] = json.loads(lines[-1]) if lines and not process.returncode else []
