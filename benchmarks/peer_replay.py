@@ -50,8 +50,8 @@ PEER = "torchrl"
 NOTE = (
     "Ours is on disk when acknowledged, with identity and provenance, and passes a router; "
     "torchrl's is in a memory-mapped file, not written out. Ours draws without replacement from "
-    "one state of the memory, by key; torchrl's with replacement. Both over TCP. Reverb's memory is "
-    "not measured: it needs a TensorFlow that needs an older NumPy."
+    "one state of the memory, by key; torchrl's with replacement. Both over TCP. Reverb's "
+    "memory is not measured: it needs a TensorFlow that needs an older NumPy."
 )
 
 
