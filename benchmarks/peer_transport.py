@@ -71,6 +71,7 @@ class GrpcSender:
 
         import grpc
 
+        self._data = b""
         self._versions: SimpleQueue[bytes | None] = SimpleQueue()
         self._server = grpc.server(ThreadPoolExecutor(max_workers=4), options=limits())
         handler = grpc.unary_stream_rpc_method_handler(self._stream)
@@ -80,9 +81,13 @@ class GrpcSender:
         self.port = self._server.add_insecure_port("127.0.0.1:0")
         self._server.start()
 
-    def publish(self, data: bytes) -> None:
-        """Send a version to the receiver."""
-        self._versions.put(data)
+    def prepare(self, data: bytes) -> None:
+        """Have a version at hand."""
+        self._data = data
+
+    def publish(self) -> None:
+        """Send the version to the receiver."""
+        self._versions.put(self._data)
 
     def close(self) -> None:
         """End the stream and the server."""
@@ -135,17 +140,21 @@ class OurSender:
     """The learner's side of the bus: announces versions and answers who asks for them."""
 
     def __init__(self, client: Bus) -> None:
-        self._client, self._version, self._data = client, 0, b""
+        self._client, self._data = client, b""
+        self._state = learner_state(0, b"")
         self._inbox: Inbox = client.inbox()
         self._inbox.serve(WEIGHTS)
         self._ended = False
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
 
-    def publish(self, data: bytes) -> None:
-        """Announce a new version."""
-        self._version, self._data = self._version + 1, data
-        self._client.publish(LEARNER_STATE, learner_state(self._version, data))
+    def prepare(self, data: bytes) -> None:
+        """Have a version and its hash at hand, as a learner has before it announces one."""
+        self._data, self._state = data, learner_state(self._state.weights_version + 1, data)
+
+    def publish(self) -> None:
+        """Announce the version."""
+        self._client.publish(LEARNER_STATE, self._state)
 
     def close(self) -> None:
         """Answer no more."""
@@ -158,7 +167,7 @@ class OurSender:
             self._inbox.wait(0.2)
             for request in self._inbox.requests():
                 with request:
-                    for part in parts(self._version, self._data):
+                    for part in parts(self._state.weights_version, self._data):
                         request.reply(part)
 
 
@@ -187,9 +196,10 @@ def receiver(code: str, address: str, versions: int) -> Iterator[IO[str]]:
 
 def delay_s(sender: GrpcSender | OurSender, said: IO[str], data: bytes) -> float:
     """Seconds from publishing a version until the other process has it."""
+    sender.prepare(data)
     time.sleep(PAUSE_S)
     published_s = time.monotonic()
-    sender.publish(data)
+    sender.publish()
     size, received_s = said.readline().split()
     assert int(size) == len(data)
     return float(received_s) - published_s
