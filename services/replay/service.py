@@ -11,6 +11,7 @@ import threading
 import time
 from pathlib import Path
 
+from services.replay.footprint import gather_heap
 from services.replay.numbering import Counters, filling, progress_of
 from services.replay.storage import Storage
 from services.replay.worker import TurnWorker
@@ -42,6 +43,7 @@ from shared.service import TICK_S, Service, Stopped, service
 
 def run(config: Config, folder: Path) -> None:
     """Keep the replay memory until stopped."""
+    gather_heap()
     identity = f"{config.run.name}/{config.run.seed}"
     storage = Storage(folder / "replay", config.memory, identity)
     try:

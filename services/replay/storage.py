@@ -160,8 +160,8 @@ class Storage(Feed):
         with self._env.begin() as txn:
             memory.worlds = list(self._meta(txn, "worlds"))
             ids = self._alive(txn)
-            for start in range(0, len(ids), PART_ROWS * 16):
-                rows, images = self._rows(txn, ids[start : start + PART_ROWS * 16])
+            for start in range(0, len(ids), PART_ROWS):
+                rows, images = self._rows(txn, ids[start : start + PART_ROWS])
                 memory.append(rows, images)
             self._overlay_rewards(txn, memory.rows)
             marks = self._stored_column(txn, "marks", MARKS)

@@ -27,6 +27,7 @@ import msgpack
 import numpy as np
 import numpy.typing as npt
 
+from services.replay.footprint import Mapping
 from services.replay.numbering import Commit, Counters
 from shared.config import MemoryConfig
 from shared.errors import StateError
@@ -89,6 +90,7 @@ class Tables:
         folder.mkdir(parents=True, exist_ok=True)
         self._config = config
         self._env = lmdb.open(str(folder), map_size=MAP_BYTES, max_dbs=len(TABLES), max_readers=64)
+        self._mapping = Mapping(folder / "data.mdb")
         self._db = {name: self._env.open_db(name.encode()) for name in TABLES}
         with self._env.begin(write=True) as txn:
             known = self._meta(txn, "identity")
@@ -163,6 +165,7 @@ class Tables:
             if len(found) != len(keys):
                 raise StateError(f"replay {table}: {len(keys) - len(found)} of {len(keys)} missing")
             parts[table] = b"".join(value for _, value in found)
+        self._mapping.let_go()
         rows = np.frombuffer(parts["samples"], SAMPLE).copy()
         images = np.frombuffer(parts["images"], np.uint8).reshape(len(ids), *IMAGE_SHAPE)
         return rows, images

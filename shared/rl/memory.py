@@ -6,7 +6,7 @@ provenance, descriptors and candidate marks. Which samples go is decided in `ret
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -43,6 +43,8 @@ SAMPLE = np.dtype(
 )
 BLOCK = 4096
 """Images per block: the store grows and shrinks by blocks and is never copied as a whole."""
+PART = 1024
+"""Images looked at together in a pass over the memory."""
 
 
 class SampleStore:
@@ -119,6 +121,12 @@ class SampleStore:
             here = blocks == block
             images[here] = self._blocks[block][places[here]]
         return images
+
+    def parts(self, ranks: npt.NDArray[np.int64]) -> Iterator[tuple[npt.NDArray[np.int64], Images]]:
+        """Some of these ranks at a time with their images: all at once may be a second memory."""
+        for start in range(0, len(ranks), PART):
+            some = ranks[start : start + PART]
+            yield some, self.images(some)
 
     def by_action(self) -> list[int]:
         """Number of samples of each action."""

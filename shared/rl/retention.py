@@ -67,9 +67,9 @@ def recompute_marks(
     Descriptors already made by this weights version are used again; forced marks stay (A44).
     """
     outdated = np.flatnonzero(memory.rows["described_by"] != version)
-    if len(outdated):
-        memory.rows["descriptor"][outdated] = describe(memory.images(outdated))
-        memory.rows["described_by"][outdated] = version
+    for some, images in memory.parts(outdated):
+        memory.rows["descriptor"][some] = describe(images)
+        memory.rows["described_by"][some] = version
     for action in range(ACTIONS):
         own = np.flatnonzero(memory.rows["action"] == action)
         similar = similar_to_newer(memory.rows["descriptor"][own], bits, config.rule)

@@ -10,10 +10,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
+from shared.rl.engine import Progress
 from shared.rl.equalisation import due, equalised
 from shared.rl.memory import SAMPLE, Ids, Images, ReplayMemory
-from shared.rl.predictor import Predictor, Progress
+from shared.rl.predictor import Predictor
 from shared.rl.retention import Discard, discard
 
 if TYPE_CHECKING:
@@ -65,16 +67,30 @@ def maintain(
     equalising: Progress | None = None,
 ) -> Maintenance:
     """Discard and, when due at episode `number`, equalise. `memory` is changed in place."""
-    dropped = discard(
-        memory,
-        config,
-        threshold_percent,
-        lambda images: predictor.descriptors(images, describing),
-        predictor.version,
-    )
+
+    def describe(images: Images) -> npt.NDArray[np.uint8]:
+        described = int(np.sum(memory.rows["described_by"] == predictor.version))
+        return predictor.descriptors(images, _beyond(described, len(memory), describing))
+
+    dropped = discard(memory, config, threshold_percent, describe, predictor.version)
     refresh = due(number, config.equalise_every) and len(memory) > 0
     if refresh:
-        images = memory.images(np.arange(len(memory)))
-        values = predictor.values(images, memory.rows["action"], equalising)
+        values = _current_values(memory, predictor, equalising)
         memory.rows["reward"] = equalised(memory.rows["reward"], values, config)
     return Maintenance(dropped, refresh)
+
+
+def _current_values(
+    memory: ReplayMemory, predictor: Predictor, progress: Progress | None
+) -> npt.NDArray[np.float32]:
+    """Q of each stored image and its action under the current weights: float32 [n]."""
+    values = np.empty(len(memory), np.float32)
+    for some, images in memory.parts(np.arange(len(memory))):
+        report = _beyond(int(some[0]), len(memory), progress)
+        values[some] = predictor.values(images, memory.rows["action"][some], report)
+    return values
+
+
+def _beyond(before: int, total: int, progress: Progress | None) -> Progress | None:
+    """Progress of a part, reported as that of the whole."""
+    return None if progress is None else lambda done, _: progress(before + done, total)

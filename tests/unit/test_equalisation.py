@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from builders import FakePredictor, fake_values, fill_store
@@ -9,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shared.config import MemoryConfig
+from shared.rl import memory as memory_module
 from shared.rl.equalisation import due, equalised
 from shared.rl.memory import ReplayMemory
 from shared.rl.turn import maintain
@@ -86,3 +89,47 @@ def test_what_is_discarded_is_not_equalised_and_what_remains_is() -> None:
     assert list(done.discarded.ids) == [1, 2]
     assert done.equalised
     assert (memory.rows["reward"] != 0.5).all()
+
+
+class Talkative(FakePredictor):
+    """Reports each image it looks at."""
+
+    def values(self, images: Any, actions: Any, progress: Any = None) -> Any:
+        for done in range(len(images)):
+            progress(done + 1, len(images))
+        return super().values(images, actions)
+
+    def descriptors(self, images: Any, progress: Any = None) -> Any:
+        for done in range(len(images)):
+            progress(done + 1, len(images))
+        return super().descriptors(images)
+
+
+@pytest.mark.parametrize("part", [1, 7, 1024])
+def test_a_pass_sees_some_images_at_a_time_and_reports_how_much_of_all(
+    part: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All images at once would be as large as the memory itself."""
+    monkeypatch.setattr(memory_module, "PART", part)
+    memory, predictor = ReplayMemory(30), Talkative(version=4)
+    fill_store(memory, range(1, 32), [0] * 31, [0.5] * 31)
+    images = memory.images(np.arange(31))
+    described: list[tuple[int, int]] = []
+    valued: list[tuple[int, int]] = []
+    done = maintain(
+        memory,
+        1,
+        MemoryConfig(capacity=30, equalise_every=1),
+        1,
+        predictor,  # type: ignore[arg-type]
+        describing=lambda *progress: described.append(progress),
+        equalising=lambda *progress: valued.append(progress),
+    )
+    assert done.discarded.recomputed
+    assert max(predictor.described) == min(part, 31)
+    assert described == [(n, 31) for n in range(1, 32)]
+    assert valued == [(n, len(memory)) for n in range(1, len(memory) + 1)]
+    kept = images[np.isin(np.arange(1, 32), memory.ids)]
+    expected = [0.7 * 0.5 + 0.3 * fake_values(image.tobytes(), 4)[0] for image in kept]
+    assert memory.rows["reward"] == pytest.approx(expected, abs=1e-6)
+    assert (memory.rows["descriptor"] == kept.reshape(len(kept), -1)[:, :15]).all()
