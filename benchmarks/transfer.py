@@ -3,7 +3,8 @@
 A router and the replay service run as processes of their own on a memory of 45,000 samples. Here
 sit a learner's mirror that takes snapshots (shared memory on and off, in turns), an actor that
 hands over episodes of 450 samples, and a learner that publishes new weights to a second process
-which says when they are ready to predict.
+which says when they are ready to predict. A second replay equalises its whole memory after every
+episode; only acknowledgements count before and after which it told that it was doing so.
 
     python -m benchmarks.transfer [--short | --check]
 """
@@ -14,40 +15,33 @@ import os
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 
 import numpy as np
 
 from benchmarks.frame import Bar, Mode, mode_of, report, rounds_of, table
+from benchmarks.prefilled import EPISODE_SAMPLES, LIFE, bus, fill, make_episode, system
 from services.learner.mirror import Mirror
-from services.monitor.supervisor import Supervisor
-from services.monitor.up import child_specs, free_endpoint
-from services.replay.storage import Storage
+from services.monitor.up import free_endpoint
 from shared import settings
-from shared.bus import Bus
+from shared.bus import Bus, Inbox
 from shared.config import Config
-from shared.errors import BusError, RouterMissing
-from shared.keys import EPISODE, LEARNER_STATE, PROGRESS, WEIGHTS
-from shared.messages import (
-    Episode,
-    EpisodeAck,
-    LearnerState,
-    ProgressRequest,
-    RobotProgress,
-)
-from shared.rl.memory import ReplayMemory
+from shared.keys import EPISODE, LEARNER_STATE, REPLAY_STATE, WEIGHTS
+from shared.messages import EpisodeAck, LearnerState, ReplayState
+from shared.numerics import settle_all
 from shared.rl.network import initialised, to_bytes, weights_hash
-from shared.rl.retention import Discard
-from shared.rl.turn import Maintenance
 from shared.weights import parts
 
-LIFE = "beec0ffeebee"
-EPISODE_SAMPLES = 450
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
+SERVED = ("router", "replay")
+PAUSE_S = 0.3
+"""Between episodes within a pass, so that they fall into several passes."""
 RECEIVER = """
 import sys, time
 from shared.config import Config
@@ -64,79 +58,6 @@ with service("actor", "bench", config) as me:
 """
 
 
-def make_episode(number: int, samples: int, *, fill: bool) -> Episode:
-    """An episode with noise for images, which no shortcut can shrink."""
-    rng = np.random.default_rng(number)
-    return Episode(
-        robot="bench",
-        life=LIFE,
-        number=number,
-        fill=fill,
-        ended="full",
-        bump=False,
-        weights_version=1,
-        fitness=500,
-        actions=samples,
-        dropped_samples=0,
-        dropped_episodes=0,
-        worlds=("plus",),
-        images=rng.bytes(samples * 3750),
-        sample_actions=rng.integers(0, 3, samples, np.uint8).tobytes(),
-        sample_rewards=rng.uniform(-0.9, 0.9, samples).astype("<f4").tobytes(),
-        sample_steps=np.arange(samples, dtype="<u4").tobytes(),
-        sample_episodes=np.full(samples, number, "<u4").tobytes(),
-        sample_versions=np.ones(samples, "<u4").tobytes(),
-        sample_worlds=bytes(samples),
-        positions=bytes(12 * samples),
-        robot_life=LIFE,
-        last_sequence=number * samples,
-    )
-
-
-def fill(folder: Path, config: Config) -> int:
-    """Write a full memory the way replay does; the number of submissions made."""
-    identity = f"{config.run.name}/{config.run.seed}"
-    storage = Storage(folder / "replay", config.memory, identity)
-    memory, number = ReplayMemory(config.memory.capacity), 0
-    while len(memory) < config.memory.capacity:
-        storage.commit(make_episode(number, EPISODE_SAMPLES, fill=True))
-        pending = storage.pending(number)
-        assert pending is not None
-        memory.worlds = storage.worlds()
-        memory.append(*storage.rows_of(pending[0]))
-        storage.apply_turn(*pending, memory, Maintenance(Discard(), equalised=False))
-        number += 1
-    storage.close()
-    return number
-
-
-@contextmanager
-def system(config: Config, folder: Path) -> Iterator[Config]:
-    """Router and replay as processes; the configuration that reaches them."""
-    stored = settings.claim(folder, config)
-    specs = child_specs(config, stored, folder, config.bus.endpoint)
-    (folder / "logs").mkdir(exist_ok=True)
-    wanted = [spec for spec in specs if spec.name in ("router", "replay")]
-    with Supervisor(wanted, folder / "logs", dict(os.environ), []):
-        yield config
-
-
-def bus(config: Config, *, shared_memory: bool = True) -> Bus:
-    """A client, as soon as the router answers and replay serves."""
-    chosen = config.bus.model_copy(update={"shared_memory": shared_memory})
-    deadline_s = time.monotonic() + PATIENCE_S
-    while True:
-        try:
-            client = Bus(chosen, config.run.name)
-            client.request(PROGRESS, ProgressRequest(robot="bench"), RobotProgress)
-            return client
-        except BusError as error:
-            if not isinstance(error, RouterMissing):
-                client.close()
-            if time.monotonic() > deadline_s:
-                raise
-
-
 def snapshot_rate(client: Bus) -> float:
     """MB/s of a snapshot, until the mirror could train on it."""
     mirror = Mirror()
@@ -147,14 +68,65 @@ def snapshot_rate(client: Bus) -> float:
 
 def acknowledged(client: Bus, first: int, count: int) -> list[float]:
     """Seconds from sending an episode of 450 samples to its acknowledgement, `count` times."""
-    spent = []
-    for number in range(first, first + count):
-        episode = make_episode(number, EPISODE_SAMPLES, fill=False)
-        start_s = time.perf_counter()
-        ack = client.request(EPISODE, episode, EpisodeAck, timeout_s=30.0)
-        spent.append(time.perf_counter() - start_s)
-        assert ack.accepted, ack.reason
-    return spent
+    return [acknowledged_once(client, number) for number in range(first, first + count)]
+
+
+def acknowledged_once(client: Bus, number: int) -> float:
+    """Seconds from sending the episode with this number to its acknowledgement."""
+    episode = make_episode(number, EPISODE_SAMPLES, fill=False)
+    start_s = time.perf_counter()
+    ack = client.request(EPISODE, episode, EpisodeAck, timeout_s=30.0)
+    spent_s = time.perf_counter() - start_s
+    assert ack.accepted, ack.reason
+    return spent_s
+
+
+@dataclass
+class During:
+    """Acknowledgements while replay told before and after that it was within a pass."""
+
+    spent: list[float] = field(default_factory=list)
+    states: list[ReplayState] = field(default_factory=list)
+    """What it told before each of them."""
+    others: int = 0
+    """Episodes that were not sent within a pass, or not for certain."""
+
+
+def acknowledged_in_passes(client: Bus, first: int, count: int) -> During:
+    """Hand over episodes, whose turns go over the whole memory, until `count` came during one."""
+    inbox = client.inbox()
+    inbox.subscribe(REPLAY_STATE, "main")
+    found, number = During(), first
+    deadline_s = time.monotonic() + PATIENCE_S + count
+    acknowledged_once(client, number)  # its turn is the first pass
+    while len(found.spent) < count:
+        before = next_state(inbox, deadline_s)
+        if not within_a_pass(before):
+            continue
+        number += 1
+        spent_s = acknowledged_once(client, number)
+        if within_a_pass(next_state(inbox, deadline_s)):
+            time.sleep(PAUSE_S)
+            found.spent.append(spent_s)
+            found.states.append(before)
+        else:
+            found.others += 1
+    return found
+
+
+def next_state(inbox: Inbox, deadline_s: float) -> ReplayState:
+    """What replay tells next; nothing it told before."""
+    inbox.take(REPLAY_STATE, ReplayState)
+    while time.monotonic() < deadline_s:
+        inbox.wait(0.5)
+        for _, state in inbox.take(REPLAY_STATE, ReplayState):
+            return state
+    raise TimeoutError("replay tells nothing, or does not go over its memory")
+
+
+def within_a_pass(state: ReplayState) -> bool:
+    """Whether replay is describing or equalising the memory right now."""
+    return state.activity in ("descriptors", "equalising") and 0.0 < state.progress < 1.0
 
 
 def ready(client: Bus, config: Config, versions: int) -> list[float]:
@@ -207,8 +179,52 @@ def learner_state(version: int, data: bytes) -> LearnerState:
     )
 
 
-def measure(mode: Mode) -> list[Bar]:
-    """All figures of P7 but the acknowledgement during a pass, which needs a trained system."""
+@contextmanager
+def learner(client: Bus, config: Config) -> Iterator[None]:
+    """Answers for the initial weights, so that replay can describe and predict."""
+    data, stop = to_bytes(initialised(config.network, 1)), threading.Event()
+    inbox = client.inbox()
+    inbox.serve(WEIGHTS)
+
+    def serve() -> None:
+        while not stop.is_set():
+            inbox.wait(0.2)
+            for request in inbox.requests():
+                with request:
+                    for part in parts(1, data):
+                        request.reply(part)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+def during_passes(mode: Mode) -> During:
+    """Acknowledgements beside a replay that equalises its memory after every episode."""
+    capacity, filters = (900, 4) if mode == "check" else (45_000, 64)
+    config = Config.model_validate(
+        {
+            "run": {"name": "bench"},
+            "bus": {"endpoint": free_endpoint(), "heartbeat_s": 0.01},
+            "memory": {"capacity": capacity, "equalise_every": 1},
+            "network": {"filters": filters},
+            "numerics": {"replay": {"threads": 0, "precision": "auto"}},
+        }
+    )
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place) / "run"
+        first = fill(folder, config)
+        settle_all(settings.claim(folder, config), folder)
+        with system(config, folder, SERVED), bus(config) as client, learner(client, config):
+            return acknowledged_in_passes(client, first, rounds_of(mode, 50, 200))
+
+
+def without_passes(mode: Mode) -> list[Bar]:
+    """Snapshots, weights, and acknowledgements while replay has nothing else to do."""
     capacity = {"check": 900, "short": 45_000, "full": 45_000}[mode]
     filters = 4 if mode == "check" else 64
     config = Config.model_validate(
@@ -223,7 +239,11 @@ def measure(mode: Mode) -> list[Bar]:
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / "run"
         first = fill(folder, config)
-        with system(config, folder), bus(config) as on, bus(config, shared_memory=False) as off:
+        with (
+            system(config, folder, SERVED),
+            bus(config) as on,
+            bus(config, shared_memory=False) as off,
+        ):
             rates: dict[bool, list[float]] = {True: [], False: []}
             for _ in range(rounds):
                 rates[False].append(snapshot_rate(off))
@@ -249,17 +269,29 @@ def _delay(name: str, spent: list[float], required: float, aim: float) -> Bar:
     return Bar(name, value, "ms p95", "lower", required, aim, None, own, len(spent))
 
 
+def measure(mode: Mode) -> tuple[str, list[Bar]]:
+    """A line on the passes, and all bars."""
+    bars, during = without_passes(mode), during_passes(mode)
+    passes = {(state.change, state.activity) for state in during.states}
+    line = (
+        f"P7e: {len(during.spent)} acknowledgements within {len(passes)} passes over "
+        f"{during.states[-1].size} samples; {during.others} others do not count"
+    )
+    return line, [*bars, _delay("P7e", during.spent, 120, 120)]
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and report."""
-    bars = measure(mode_of(arguments, __doc__))
+    line, bars = measure(mode_of(arguments, __doc__))
     what = {
         "P7a": "snapshot, shared memory off",
         "P7b": "snapshot, shared memory on",
         "P7c": "weights published until ready",
         "P7d": "episode of 450 until on disk",
+        "P7e": "the same during a pass over the memory",
     }
     rows = [[what[bar.id], bar.value, bar.unit, bar.n] for bar in bars]
-    report("Bulk transfer", [table(["what", "value", "unit", "n"], rows)], bars)
+    report("Bulk transfer", [table(["what", "value", "unit", "n"], rows), line], bars)
 
 
 if __name__ == "__main__":
