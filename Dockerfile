@@ -44,11 +44,12 @@ RUN if [ -n "$TORCH_INDEX_URL" ]; then \
     pip install --constraint constraints.txt '.[actor]'
 
 FROM torch AS actor-env
+RUN pip install --constraint constraints.txt '.[actor,openvino]'
 COPY --from=code /wheels /wheels
 RUN pip install --no-deps --force-reinstall /wheels/*.whl
 
 FROM torch AS replay-env
-RUN pip install --constraint constraints.txt '.[replay]'
+RUN pip install --constraint constraints.txt '.[replay,openvino]'
 COPY --from=code /wheels /wheels
 RUN pip install --no-deps --force-reinstall /wheels/*.whl
 

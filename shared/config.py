@@ -224,19 +224,31 @@ class LearningConfig(Section):
 class Numerics(Section):
     """Arithmetic of one role. It is part of the configuration: equal settings, equal bits."""
 
-    device: Literal["cpu", "cuda"] = "cpu"
+    device: Literal["cpu", "cuda", "auto"] = "cpu"
+    """auto: a GPU where there is one, found when the run first starts, then fixed in its folder."""
+    engine: Literal["torch", "openvino", "auto"] = "torch"
+    """What predicts on a CPU; auto: the faster one of those installed, measured when the run first
+    starts, then fixed in its folder. Training is always torch's."""
     threads: int = Field(default=1, ge=0, le=256)
     """0: chosen when the run first starts, then fixed in its folder."""
     precision: Literal["float32", "bfloat16", "auto"] = "float32"
-    """bfloat16: convolutions under autocast, everything else float32; auto: what is faster here,
-    measured when the run first starts, then fixed in its folder."""
+    """bfloat16: the convolutions when predicting, their backward pass when training (the forward
+    pass does not stand it); auto: what is faster here, measured when the run first starts, then
+    fixed in its folder."""
     batch: int = Field(default=32, ge=1, le=4096)
     """Images per pass; inference pads to it so that results do not depend on company."""
+    cuda_batch: int = Field(default=2048, ge=1, le=65536)
+    """Images per pass where the device is a GPU."""
 
     @property
     def settled(self) -> bool:
         """Whether nothing is left to be chosen."""
-        return self.threads > 0 and self.precision != "auto"
+        return self.threads > 0 and "auto" not in (self.device, self.engine, self.precision)
+
+    @property
+    def images_per_pass(self) -> int:
+        """`batch` or `cuda_batch`, by the device."""
+        return self.cuda_batch if self.device == "cuda" else self.batch
 
 
 class ActorNumerics(Numerics):
@@ -244,13 +256,16 @@ class ActorNumerics(Numerics):
 
     batch: int = Field(default=1, ge=1, le=4096)
     """Observations per pass."""
+    cuda_batch: int = Field(default=1, ge=1, le=65536)
+    """Observations per pass where the device is a GPU."""
 
 
 class LearnerNumerics(Numerics):
-    """Training: small parts stay in the processor's caches."""
+    """Training: a mini-batch is shared among the threads, each taking its share in parts."""
 
-    batch: int = Field(default=16, ge=1, le=4096)
-    """Images per part of a mini-batch; their gradients are added up."""
+    engine: Literal["torch"] = "torch"
+    batch: int = Field(default=8, ge=1, le=4096)
+    """Images per part: small ones stay in the processor's caches."""
 
 
 class NumericsConfig(Section):

@@ -115,10 +115,11 @@ class LearnerLoop:
         start_s = time.monotonic()
         self._activity = "synchronising"
         self._me.insist("pull changes from replay", lambda: self._reach(turn.change))
+        steps_before = self._trainer.train_steps
         losses = self._learn(turn)
         changed = self._trainer.apply_target_rule(turn.episode, turn.bump)
         self._loss = float(np.mean(losses)) if losses else None
-        self._record(turn, losses, time.monotonic() - start_s)
+        self._record(turn, self._trainer.train_steps - steps_before, time.monotonic() - start_s)
         self._activity = "checkpoint"
         checkpoint.write(self._path, self._trainer, turn.episode, self._identity)
         if changed:
@@ -132,11 +133,15 @@ class LearnerLoop:
         self._mirror.reach(self._me.bus, change)
 
     def _learn(self, turn: Turn) -> list[float]:
-        """All mini-batches of this turn, answering requests in between. Raises Stopped."""
+        """All mini-batches of this turn, answering requests in between; the losses.
+
+        Raises Stopped.
+        """
         losses = []
         try:
             for trained in self._trainer.learn(self._mirror.samples, turn.episode):
-                losses.append(trained.loss)
+                if trained.loss is not None:
+                    losses.append(trained.loss)
                 self._trained = trained
                 self._activity = "fitting" if trained.batches else "training"
                 self._serve()
@@ -149,14 +154,14 @@ class LearnerLoop:
             ) from error
         return losses
 
-    def _record(self, turn: Turn, losses: list[float], seconds: float) -> None:
+    def _record(self, turn: Turn, mini_batches: int, seconds: float) -> None:
         trainer = self._trainer
         self._metrics.write(
             {
                 "episode": turn.episode,
-                "mini_batches": len(losses),
+                "mini_batches": mini_batches,
                 "loss": self._loss if self._loss is not None else "none",
-                "fitting": int(bool(losses) and self._trained.batches > 0),
+                "fitting": int(mini_batches > 0 and self._trained.batches > 0),
                 "seconds": round(seconds, 3),
                 "train_steps": trainer.train_steps,
                 "fits": trainer.fits,

@@ -2,32 +2,33 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from shared.rl import trunk
+from shared.rl.batches import Batches, Ranks, ResidentBatches, StoredBatches
 from shared.rl.draws import generator
+from shared.rl.engine import arithmetic, scaled
 from shared.rl.equalisation import due
 from shared.rl.memory import SampleStore
 from shared.rl.network import QNetwork, initialised
-from shared.rl.predictor import arithmetic, feature_maps, network_input
 
 if TYPE_CHECKING:
     from shared.config import LearningConfig, NetworkConfig, Numerics
-
-Ranks = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Trained:
     """One mini-batch done. epoch and batches count the running fitting phase, 0 outside one."""
 
-    loss: float
+    loss: float | None
+    """None where it is not known yet: a fitting phase on a GPU tells the mean of all at its end."""
     epoch: int
     batch: int
     batches: int
@@ -53,6 +54,8 @@ class Trainer:
             alpha=learning.rmsprop_alpha,
             eps=learning.rmsprop_epsilon,
         )
+        self._in_a_share = numerics.model_copy(update={"threads": 1})
+        self._pool = ThreadPoolExecutor(max(1, numerics.threads), "share of a mini-batch")
         self.train_steps = 0
         self.fits = 0
         self.version = 1
@@ -91,27 +94,12 @@ class Trainer:
     def step(self, samples: SampleStore, ranks: Ranks) -> float:
         """One RMSprop step on the mean squared error of the unclipped output (Eq 3.4, E8).
 
-        The gradient of a mini-batch is gathered over parts of `numerics.batch` images. Returns the
-        loss; raises FloatingPointError when it is not finite, leaving the weights as they were.
+        Returns the loss; raises FloatingPointError when it is not finite, leaving the weights as
+        they were.
         """
-        device, part = self._numerics.device, self._numerics.batch
-        loss = 0.0
-        self._optimiser.zero_grad(set_to_none=True)
-        with arithmetic(self._numerics):
-            for start in range(0, len(ranks), part):
-                some = ranks[start : start + part]
-                images = network_input(samples.images(some), device)
-                actions = _tensor(samples.rows["action"][some].astype(np.int64), device)
-                rewards = _tensor(samples.rows["reward"][some], device)
-                maps = feature_maps(self.train_network, images, self._numerics)
-                values = self.train_network.values(maps, actions)
-                error = (rewards - values).square().sum() / len(ranks)
-                torch.autograd.backward(error)
-                loss += float(error.detach())
-            if not np.isfinite(loss):
-                raise FloatingPointError(f"loss is {loss} at training step {self.train_steps}")
-            self._optimiser.step()
-        self.train_steps += 1
+        batches = StoredBatches(samples, self._numerics.device)
+        loss = self._checked(float(self._set_gradients(batches, ranks)))
+        self._apply_gradients()
         return loss
 
     def tensors(self) -> dict[str, Tensor]:
@@ -156,18 +144,82 @@ class Trainer:
 
     def _fit(self, samples: SampleStore, episode: int) -> Iterator[Trained]:
         """A36: epochs of shuffled mini-batches, the last, partial one included (E30)."""
-        batches, done = self.fit_batches(len(samples)), 0
-        for epoch in range(self._learning.fit_epochs):
-            order = generator(self._seed, "fit", episode, epoch).permutation(len(samples))
-            for start in range(0, len(order), self._learning.batch_size):
-                done += 1
-                loss = self.step(samples, order[start : start + self._learning.batch_size])
-                yield Trained(loss, epoch + 1, done, batches)
+        deferred = self._numerics.device != "cpu"
+        steps = self._deferred_steps if deferred else self._steps
+        batches = self.fit_batches(len(samples))
+        for done, (epoch, loss) in enumerate(steps(samples, episode), 1):
+            yield Trained(loss, epoch + 1, done, batches)
         self.fits += 1
 
+    def _steps(self, samples: SampleStore, episode: int) -> Iterator[tuple[int, float | None]]:
+        """The steps of a fitting phase: the epoch each belongs to, and its loss."""
+        for epoch, ranks in self._shuffled(len(samples), episode):
+            yield epoch, self.step(samples, ranks)
 
-def _tensor(values: npt.NDArray[np.generic], device: str) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values)).to(device)
+    def _deferred_steps(
+        self, samples: SampleStore, episode: int
+    ) -> Iterator[tuple[int, float | None]]:
+        """The same without ever waiting for the device: the losses are read at the end.
+
+        Samples are copied to the device once. Raises FloatingPointError after the last step when
+        a loss was not finite; the weights are useless then.
+        """
+        batches, losses = ResidentBatches(samples, self._numerics.device), []
+        last = self.fit_batches(len(samples))
+        for epoch, ranks in self._shuffled(len(samples), episode):
+            losses.append(self._set_gradients(batches, ranks))
+            self._apply_gradients()
+            ended = len(losses) == last
+            yield epoch, self._checked(float(torch.stack(losses).mean())) if ended else None
+
+    def _shuffled(self, count: int, episode: int) -> Iterator[tuple[int, Ranks]]:
+        for epoch in range(self._learning.fit_epochs):
+            order = generator(self._seed, "fit", episode, epoch).permutation(count)
+            for start in range(0, count, self._learning.batch_size):
+                yield epoch, order[start : start + self._learning.batch_size]
+
+    def _set_gradients(self, batches: Batches, ranks: Ranks) -> Tensor:
+        """Put the gradient of a mini-batch where the optimiser looks; returns the loss.
+
+        Each thread takes one share of the mini-batch, and the shares are added up in order: the
+        result depends on the number of threads, never on how they run. Threads that wait for each
+        other after every operation would be slower, and hopeless beside another busy process.
+        """
+        size = -(-len(ranks) // self._numerics.threads)
+        shares = [ranks[start : start + size] for start in range(0, len(ranks), size)]
+        work = [self._pool.submit(self._share, batches, share, len(ranks)) for share in shares[1:]]
+        loss, *gradients = self._share(batches, shares[0], len(ranks))
+        others = [each.result() for each in work]
+        for more, *further in others:
+            loss = loss + more
+            for own, other in zip(gradients, further, strict=True):
+                own.add_(other)
+        for parameter, gradient in zip(self.train_network.parameters(), gradients, strict=True):
+            parameter.grad = gradient
+        return loss
+
+    def _share(self, batches: Batches, ranks: Ranks, count: int) -> tuple[Tensor, ...]:
+        """Loss and gradients of one share of a mini-batch of `count`."""
+        network, part = self.train_network, self._numerics.images_per_pass
+        reduced = self._numerics.precision == "bfloat16"
+        with arithmetic(self._in_a_share):
+            batch = batches.take(ranks)
+            parts = [scaled(some) for some in batch.images.split(part)]  # type: ignore[no-untyped-call]
+            maps = [trunk.maps(network, p) if reduced else network.maps(p) for p in parts]
+            error = batch.rewards - network.values(torch.cat(maps), batch.actions)
+            loss = error.square().sum() / count
+            return loss.detach(), *torch.autograd.grad(loss, list(network.parameters()))
+
+    def _apply_gradients(self) -> None:
+        with arithmetic(self._numerics):
+            self._optimiser.step()
+        self.train_steps += 1
+
+    def _checked(self, loss: float) -> float:
+        """Raise FloatingPointError for a loss that is not finite."""
+        if not math.isfinite(loss):
+            raise FloatingPointError(f"loss is {loss} at training step {self.train_steps}")
+        return loss
 
 
 def _copy_checked(own: Tensor, given: Tensor, name: str) -> None:

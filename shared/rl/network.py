@@ -22,6 +22,8 @@ MAP_HEIGHT, MAP_WIDTH = 9, 15
 """MaxPool2 maps: valid padding, stride 1, floor pooling (E16)."""
 ACTION_VECTORS = ((1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (1.0, 0.0, 1.0))
 """A21; the first bit is always 1 and kept for shape fidelity (E35)."""
+POOLED = {"ccpccp": (False, True, False, True), "cpcccp": (True, False, False, True)}
+"""Which of the four convolutions a pool follows, by layout (E16)."""
 MAX_WEIGHT_BYTES = 64 * 1024 * 1024
 
 
@@ -34,6 +36,7 @@ class QNetwork(nn.Module):
         super().__init__()
         filters = config.filters
         self.layout = config.layout
+        self.pooled = POOLED[config.layout]
         self.conv1 = nn.Conv2d(1, filters, 3)
         self.conv2 = nn.Conv2d(filters, filters, 3)
         self.conv3 = nn.Conv2d(filters, filters, 3)
@@ -44,20 +47,23 @@ class QNetwork(nn.Module):
         self.out = nn.Linear(128, 1)
         self.register_buffer("action_vectors", torch.tensor(ACTION_VECTORS), persistent=False)
 
+    @property
+    def convolutions(self) -> tuple[nn.Conv2d, ...]:
+        """Conv1-4 in order."""
+        return self.conv1, self.conv2, self.conv3, self.conv4
+
     def maps(self, images: Tensor) -> Tensor:
         """MaxPool2 feature maps [n, filters, 9, 15] of images [n, 1, 50, 75] in [0, 1].
 
         ReLU comes after pooling where the two meet: both orders are equal, this one is cheaper.
         """
-        x = F.relu(self.conv1(images))
-        if self.layout == "ccpccp":
-            x = F.relu(F.max_pool2d(self.conv2(x), 2))
-            x = F.relu(self.conv3(x))
-        else:
-            x = F.max_pool2d(x, 2)
-            x = F.relu(self.conv2(x))
-            x = F.relu(self.conv3(x))
-        return F.relu(F.max_pool2d(self.conv4(x), 2))
+        x = images
+        for conv, pooled in zip(self.convolutions, self.pooled, strict=True):
+            x = conv(x)
+            if pooled:
+                x = F.max_pool2d(x, 2)
+            x = F.relu(x)
+        return x
 
     def values(self, maps: Tensor, actions: Tensor) -> Tensor:
         """Unclipped Q(s, a) [n] from maps [n, filters, 9, 15] and action numbers [n]."""

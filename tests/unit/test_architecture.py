@@ -54,8 +54,9 @@ def test_nothing_that_executes_what_it_reads() -> None:
 def test_the_algorithm_has_no_clock_socket_file_logger_or_environment() -> None:
     pure = {name for file, name in imports() if file.startswith("shared/rl/")}
     assert pure <= {
-        "__future__", "collections", "contextlib", "dataclasses", "hashlib", "json", "typing",
-        "cv2", "numpy", "safetensors", "torch", "shared",
+        "__future__", "collections", "concurrent", "contextlib", "copy", "dataclasses",
+        "hashlib", "json", "math", "typing",
+        "cv2", "numpy", "openvino", "safetensors", "torch", "shared",
     }  # fmt: skip
 
 

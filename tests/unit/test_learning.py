@@ -12,11 +12,12 @@ from builders import fill_store
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shared.config import LearningConfig, NetworkConfig, Numerics
+from shared.config import LearnerNumerics, LearningConfig, NetworkConfig, Numerics
+from shared.rl.batches import StoredBatches
+from shared.rl.engine import network_input
 from shared.rl.learning import Trained, Trainer
 from shared.rl.memory import SampleStore
 from shared.rl.network import QNetwork, to_bytes
-from shared.rl.predictor import network_input
 
 torch.set_num_threads(1)
 SMALL = NetworkConfig(filters=4)
@@ -369,3 +370,52 @@ def test_missing_counters_are_refused() -> None:
     del counters["version"]
     with pytest.raises(KeyError, match="version"):
         make_trainer().restore(trainer.tensors(), counters)
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_shares_of_several_threads_add_up_to_the_mini_batch(precision: Any) -> None:
+    store, ranks, trainers = make_store(13), np.arange(13), []
+    bound = 1e-5 if precision == "float32" else 0.01  # bfloat16 rounds the gradient of each part
+    for threads in (1, 2, 2, 3, 16):
+        numerics = LearnerNumerics(threads=threads, batch=4, precision=precision)
+        trainer = Trainer(SMALL, LearningConfig(), numerics, 1)
+        trainer._set_gradients(StoredBatches(store, "cpu"), ranks)
+        trainers.append(trainer)
+    alone, two, again, *others = (
+        [p.grad for p in trainer.train_network.parameters()] for trainer in trainers
+    )
+    assert all(torch.equal(a, b) for a, b in zip(two, again, strict=True))
+    for gradients in (two, *others):
+        for own, expected in zip(gradients, alone, strict=True):
+            assert float((own - expected).norm()) <= bound * float(expected.norm())
+
+
+def test_a_share_that_fails_is_heard_of() -> None:
+    trainer = Trainer(SMALL, LearningConfig(), LearnerNumerics(threads=2), 1)
+    with pytest.raises(IndexError):
+        trainer.step(make_store(8), np.array([0, 1, 2, 99]))
+    assert trainer.train_steps == 0
+
+
+def test_deferred_steps_are_the_same_steps() -> None:
+    """What a GPU does runs here on the CPU: resident samples, losses read at the end."""
+    learning = LearningConfig(fit_every=4, fit_epochs=2, batch_size=5)
+    store = make_store(12)
+    plain = Trainer(SMALL, learning, LearnerNumerics(batch=4), 1)
+    losses = [t.loss for t in plain.learn(store, 4)]
+    deferred = Trainer(SMALL, learning, LearnerNumerics(batch=4), 1)
+    steps = list(deferred._deferred_steps(store, 4))
+    assert [epoch for epoch, _ in steps] == [0, 0, 0, 1, 1, 1]
+    assert [loss for _, loss in steps[:-1]] == [None] * 5
+    assert steps[-1][1] == pytest.approx(np.mean([loss for loss in losses if loss is not None]))
+    assert deferred.train_steps == plain.train_steps == 6
+    for name, tensor in plain.tensors().items():
+        assert torch.equal(tensor, deferred.tensors()[name]), name
+
+
+def test_deferred_steps_report_a_loss_that_is_not_finite() -> None:
+    trainer = Trainer(SMALL, LearningConfig(batch_size=8), LearnerNumerics(), 1)
+    with torch.no_grad():
+        trainer.train_network.out.bias.fill_(float("nan"))
+    with pytest.raises(FloatingPointError):
+        list(trainer._deferred_steps(make_store(8), 100))

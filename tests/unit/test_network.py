@@ -12,6 +12,7 @@ from builders import make_images
 from safetensors.torch import save
 
 from shared.config import NetworkConfig, Numerics
+from shared.rl.engine import network_input
 from shared.rl.network import (
     QNetwork,
     initialised,
@@ -20,7 +21,7 @@ from shared.rl.network import (
     to_bytes,
     weights_hash,
 )
-from shared.rl.predictor import Predictor, network_input
+from shared.rl.predictor import Predictor
 
 torch.set_num_threads(1)
 Layout = Literal["ccpccp", "cpcccp"]

@@ -1,4 +1,4 @@
-"""Threads and precision are chosen once and then stay."""
+"""Device, engine, threads and precision are chosen once and then stay."""
 
 from __future__ import annotations
 
@@ -7,8 +7,15 @@ from pathlib import Path
 import pytest
 
 from shared import numerics
-from shared.config import ActorNumerics, Config, NetworkConfig, Numerics, NumericsConfig
-from shared.errors import StateError
+from shared.config import (
+    ActorNumerics,
+    Config,
+    LearnerNumerics,
+    NetworkConfig,
+    Numerics,
+    NumericsConfig,
+)
+from shared.errors import ConfigError, StateError
 from shared.rl.predictor import Predictor
 
 OPEN = Config(
@@ -20,10 +27,10 @@ OPEN = Config(
 
 
 def test_choice_is_made_once_and_read_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(numerics, "_seconds", lambda *_: 0.5)
+    monkeypatch.setattr(numerics, "_seconds", lambda *_: [1.0, 0.5])
     first = numerics.settle(OPEN, tmp_path, "actor")
     assert (first.precision, first.threads, first.batch) == ("bfloat16", 1, 1)
-    monkeypatch.setattr(numerics, "_seconds", lambda *_: 2.0)
+    monkeypatch.setattr(numerics, "_seconds", lambda *_: [1.0, 2.0])
     assert numerics.settle(OPEN, tmp_path, "actor") == first
 
 
@@ -31,7 +38,7 @@ def test_choice_is_made_once_and_read_back(tmp_path: Path, monkeypatch: pytest.M
 def test_reduced_precision_must_be_worth_it(
     ratio: float, precision: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(numerics, "_seconds", lambda *_: ratio)
+    monkeypatch.setattr(numerics, "_seconds", lambda *_: [1.0, ratio])
     assert numerics.choose(OPEN, OPEN.numerics.actor, "actor").precision == precision
 
 
@@ -58,6 +65,47 @@ def test_damaged_choice_is_named(text: str, tmp_path: Path) -> None:
 
 
 def test_unsettled_numerics_are_refused_by_the_network() -> None:
-    predictor = Predictor(OPEN.network, OPEN.numerics.actor)
     with pytest.raises(ValueError, match="settled"):
-        predictor.all_values(__import__("numpy").zeros((1, 50, 75), "uint8"))
+        Predictor(OPEN.network, OPEN.numerics.actor)
+
+
+@pytest.mark.parametrize(
+    ("times", "engine", "precision"),
+    [
+        ([1.0, 0.9, 0.9, 0.9], "torch", "float32"),
+        ([1.0, 0.7, 0.6, 0.5], "openvino", "bfloat16"),
+        ([1.0, 0.4, 0.6, 0.5], "openvino", "float32"),
+        ([1.0, 0.9, 0.3, 0.5], "torch", "bfloat16"),
+    ],
+)
+def test_the_fastest_engine_and_precision_are_chosen_together(
+    times: list[float], engine: str, precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(numerics, "_seconds", lambda *_: times)
+    monkeypatch.setattr(numerics, "_has_openvino", lambda: True)
+    chosen = numerics.choose(OPEN, Numerics(engine="auto", precision="auto"), "replay")
+    assert (chosen.engine, chosen.precision) == (engine, precision)
+
+
+def test_an_engine_that_is_missing_is_never_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(numerics, "_has_openvino", lambda: False)
+    assert numerics.choose(OPEN, Numerics(engine="auto"), "replay").engine == "torch"
+    with pytest.raises(ConfigError, match=r"'openvino' is not installed.*corridor\[openvino\]"):
+        numerics.choose(OPEN, Numerics(engine="openvino", threads=0), "replay")
+
+
+@pytest.mark.parametrize(("gpu", "device"), [(True, "cuda"), (False, "cpu")])
+def test_a_gpu_is_taken_where_there_is_one(
+    gpu: bool, device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(numerics, "_has_gpu", lambda: gpu)
+    wanted = LearnerNumerics(device="auto")
+    assert not wanted.settled
+    chosen = numerics.choose(OPEN, wanted, "learner")
+    assert (chosen.device, chosen.settled) == (device, True)
+    assert chosen.images_per_pass == (2048 if gpu else wanted.batch)
+
+
+def test_the_learner_is_measured_by_training(tmp_path: Path) -> None:
+    chosen = numerics.choose(OPEN, LearnerNumerics(precision="auto", threads=0), "learner")
+    assert chosen.settled

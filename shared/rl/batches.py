@@ -1,0 +1,58 @@
+"""Mini-batches as tensors: gathered from the store, or from a copy of it on the GPU."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from shared.rl.memory import SampleStore
+
+Ranks = npt.NDArray[np.int64]
+
+
+class Batch(NamedTuple):
+    """k samples: images uint8 [k, 50, 75], actions int64 [k], rewards float32 [k]."""
+
+    images: Tensor
+    actions: Tensor
+    rewards: Tensor
+
+
+class Batches(Protocol):
+    """Where mini-batches come from."""
+
+    def take(self, ranks: Ranks) -> Batch:
+        """The samples at these ranks, on the device that trains."""
+
+
+class StoredBatches:
+    """Gathered from the store, copied to the device."""
+
+    def __init__(self, samples: SampleStore, device: str) -> None:
+        self._samples, self._device = samples, device
+
+    def take(self, ranks: Ranks) -> Batch:
+        """Copies of the samples at these ranks."""
+        rows = self._samples.rows
+        return Batch(
+            torch.from_numpy(self._samples.images(ranks)).to(self._device),
+            torch.from_numpy(rows["action"][ranks].astype(np.int64)).to(self._device),
+            torch.from_numpy(rows["reward"][ranks].astype(np.float32)).to(self._device),
+        )
+
+
+class ResidentBatches:
+    """All samples on the device, images as uint8, so that gathering never waits for the host."""
+
+    def __init__(self, samples: SampleStore, device: str) -> None:
+        everything = np.arange(len(samples), dtype=np.int64)
+        self._all, self._device = StoredBatches(samples, device).take(everything), device
+
+    def take(self, ranks: Ranks) -> Batch:
+        """Copies of the samples at these ranks, made on the device."""
+        places = torch.from_numpy(ranks).to(self._device, non_blocking=True)
+        return Batch(*(column[places] for column in self._all))
