@@ -10,6 +10,8 @@ TRIM_THRESHOLD, MMAP_THRESHOLD, ARENA_MAX = -1, -3, -8  # names of mallopt
 KEPT_BYTES = 512 * 1024 * 1024
 LARGEST_BYTES = 32 * 1024 * 1024
 """The most glibc lets come from the heap."""
+MOST_PAGES = 4096
+"""Pages of the file held at most, about: 16 MB."""
 
 
 def gather_heap() -> None:
@@ -36,6 +38,17 @@ class Mapping:
     def __init__(self, path: Path) -> None:
         self._ranges = _ranges_of(path.resolve())
         self._madvise = ctypes.CDLL(None).madvise if self._ranges else None
+        self._looked_at = 0
+
+    def looked_at(self, pages: int) -> None:
+        """Count pages, and let go of all when they are many: getting them again takes time.
+
+        Threads may lose a count to each other: then it happens a little later.
+        """
+        self._looked_at += pages
+        if self._looked_at >= MOST_PAGES:
+            self._looked_at = 0
+            self.let_go()
 
     def let_go(self) -> None:
         """Let go of all pages. Harmless beside readers and writers: they get them again.

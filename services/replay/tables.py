@@ -165,7 +165,7 @@ class Tables:
             if len(found) != len(keys):
                 raise StateError(f"replay {table}: {len(keys) - len(found)} of {len(keys)} missing")
             parts[table] = b"".join(value for _, value in found)
-        self._mapping.let_go()
+        self._mapping.looked_at(len(ids))  # an image takes a page
         rows = np.frombuffer(parts["samples"], SAMPLE).copy()
         images = np.frombuffer(parts["images"], np.uint8).reshape(len(ids), *IMAGE_SHAPE)
         return rows, images
