@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from statistics import median
+from typing import Literal
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from shared.rl.predictor import Predictor
 AT_ONCE = {"P2a": (1, 2.5, 4.5), "P2b": (8, 3.5, 5.5)}
 """Observations at once, required and aimed at."""
 SLOWED_AT_MOST = 3.0
+PRECISIONS: tuple[Literal["float32", "bfloat16"], ...] = ("float32", "bfloat16")
 SPIN = "while True: pass"
 AGREEMENT_BATCH = 32
 
@@ -45,8 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name, (at_once, required, aim) in AT_ONCE.items():
         times, found = measure(mode, at_once, chosen)
         tables += found
-        bar = speedup(name, times["plain"], times[chosen.precision], required, aim)
-        checks = {"actions_equal": agreed[chosen.precision], "threads": float(chosen.threads)}
+        bar = speedup(name, times["plain"], times[label(chosen)], required, aim)
+        checks = {"actions_equal": agreed[label(chosen)], "threads": float(chosen.threads)}
         bars.append(replace(bar, checks=checks))
     neighbour, beside = beside_a_neighbour(mode, chosen)
     tables += [beside, third]
@@ -58,7 +60,21 @@ def settled(mode: Mode) -> Numerics:
     if mode == "check":
         return ActorNumerics()
     config = Config(network=frames.network_config(mode))
-    return choose(config, ActorNumerics(precision="auto"), "actor")
+    return choose(config, ActorNumerics(engine="auto", precision="auto"), "actor")
+
+
+def label(numerics: Numerics) -> str:
+    return f"{numerics.engine} {numerics.precision}"
+
+
+def ways(mode: Mode, batch: int, threads: int = 1) -> list[Numerics]:
+    """Every engine in every precision; only plain torch where only the running is checked."""
+    engines: tuple[Literal["torch", "openvino"], ...] = ("torch", "openvino")
+    return [
+        ActorNumerics(engine=engine, precision=precision, batch=batch, threads=threads)
+        for engine in (engines[:1] if mode == "check" else engines)
+        for precision in PRECISIONS
+    ]
 
 
 def measure(mode: Mode, at_once: int, chosen: Numerics) -> tuple[Times, list[str]]:
@@ -82,17 +98,13 @@ def cases(mode: Mode, at_once: int, threads: int) -> dict[str, Callable[[], obje
     found: dict[str, Callable[[], object]] = {
         "plain": partial(plain.all_values, naive, images, threads)
     }
-    for precision in ("float32", "bfloat16"):
-        ours = predictor(mode, precision, batch=at_once, threads=threads)
-        found[precision] = partial(ours.all_values, images)
+    for numerics in ways(mode, at_once, threads):
+        found[label(numerics)] = partial(predictor(mode, numerics).all_values, images)
     return found
 
 
-def predictor(mode: Mode, precision: str, batch: int, threads: int) -> Predictor:
+def predictor(mode: Mode, numerics: Numerics) -> Predictor:
     """One of ours with the quickly trained weights."""
-    numerics = ActorNumerics.model_validate(
-        {"precision": precision, "batch": batch, "threads": threads}
-    )
     ours = Predictor(frames.network_config(mode), numerics)
     ours.load(1, frames.trained_weights(mode))
     return ours
@@ -103,7 +115,7 @@ def beside_a_neighbour(mode: Mode, chosen: Numerics) -> tuple[Bar, str]:
     rounds = rounds_of(mode, short=60, full=400)
     images, rows, bar = frames.images(mode, 1), [], None
     for threads in sorted({1, 2, chosen.threads}) if mode != "check" else (1,):
-        ours = predictor(mode, chosen.precision, batch=1, threads=threads)
+        ours = predictor(mode, chosen.model_copy(update={"batch": 1, "threads": threads}))
         case = {"ours": partial(ours.all_values, images)}
         quiet = median(interleaved(case, rounds, warm_up=5)["ours"]) * 1e3
         with spinning():
@@ -137,13 +149,13 @@ def frames_used(mode: Mode) -> int:
 
 
 def agreement(mode: Mode) -> tuple[dict[str, float], str]:
-    """Part of real frames where the greedy action is that of plain float32, by precision.
+    """Part of real frames where the greedy action is that of plain float32, by engine, precision.
 
     The lower of trained and untrained weights; the table tells them apart, and says how often each
     action is the greedy one: where it is always the same, agreement is cheap.
     """
     images, config = frames.images(mode, frames_used(mode)), frames.network_config(mode)
-    worst, rows = {"float32": 1.0, "bfloat16": 1.0}, []
+    worst, rows = {label(way): 1.0 for way in ways(mode, AGREEMENT_BATCH)}, []
     for weights, data in (
         ("trained", frames.trained_weights(mode)),
         ("untrained", frames.untrained_weights(mode)),
@@ -152,13 +164,18 @@ def agreement(mode: Mode) -> tuple[dict[str, float], str]:
         shares = " ".join(
             f"{part:.0%}" for part in np.bincount(expected, minlength=3) / len(images)
         )
-        for precision in worst:
-            ours = predictor(mode, precision, AGREEMENT_BATCH, threads=1)
+        for way in ways(mode, AGREEMENT_BATCH):
+            ours = predictor(mode, way)
             ours.load(1, data)
             equal = float(np.mean(ours.all_values(images).argmax(axis=1) == expected))
-            worst[precision] = min(worst[precision], equal)
-            rows.append([precision, weights, f"{equal:.4%}", shares])
-    head = ["precision", "weights", f"actions as plain, {len(images)} frames", "share of each"]
+            worst[label(way)] = min(worst[label(way)], equal)
+            rows.append([label(way), weights, f"{equal:.4%}", shares])
+    head = [
+        "engine and precision",
+        "weights",
+        f"actions as plain, {len(images)} frames",
+        "share of each",
+    ]
     return worst, table(head, rows)
 
 
