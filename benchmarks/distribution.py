@@ -43,7 +43,7 @@ def configuration(filters: int = 64) -> Config:
             "network": {"filters": filters},
         }
     )
-    chosen = choose(base, ActorNumerics(precision="auto"), "actor")
+    chosen = choose(base, ActorNumerics(engine="auto", precision="auto"), "actor")
     numerics = base.numerics.model_copy(update={"actor": chosen, "replay": Numerics(batch=1)})
     return base.model_copy(update={"numerics": numerics})
 

@@ -60,10 +60,17 @@ def full_memory(size: int, draw: np.random.Generator) -> ReplayMemory:
     """A memory of exactly `size` samples; all images are black."""
     memory = ReplayMemory(size)
     memory.worlds = ["plus"]
-    for first in range(0, size, 5000):
-        count = min(5000, size - first)
-        memory.append(rows_of(first + 1, count, draw), np.zeros((count, 50, 75), np.uint8))
+    append_black(memory, size, draw)
     return memory
+
+
+def append_black(memory: ReplayMemory, count: int, draw: np.random.Generator) -> None:
+    """Append so many samples with black images."""
+    while count > 0:
+        some = min(5000, count)
+        first = int(memory.ids[-1]) + 1 if len(memory) else 1
+        memory.append(rows_of(first, some, draw), np.zeros((some, 50, 75), np.uint8))
+        count -= some
 
 
 def measure(size: int, rounds: int) -> Times:
@@ -80,10 +87,12 @@ def measure(size: int, rounds: int) -> Times:
     ]
     memory.rows["candidate"], memory.rows["marked_by"] = True, 1
     images, appends, both = np.zeros((EPISODE_SAMPLES, 50, 75), np.uint8), [], []
-    for number in range(rounds):
-        rows = rows_of(size + 1 + number * EPISODE_SAMPLES, EPISODE_SAMPLES, draw)
+    for _ in range(rounds):
+        append_black(memory, size - len(memory), draw)  # or there would be nothing to discard
+        rows = rows_of(int(memory.ids[-1]) + 1, EPISODE_SAMPLES, draw)
         appends.append(seconds(lambda rows=rows: memory.append(rows, images)))
         both.append(appends[-1] + seconds(lambda: discard(memory, config, 1, describe, 1)))
+        assert len(memory) < size
     return Times(median(passes), median(appends), median(both))
 
 

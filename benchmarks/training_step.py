@@ -35,8 +35,8 @@ from shared.rl.network import QNetwork, load_bytes
 REQUIRED, AIM = 4.0, 6.0
 MINI_BATCH = 128
 PARTS = (4, 8, 16, 32)
-KEPT = """Much of the plain step's time goes into fresh memory, which the C library returns after every
-large operation. With that turned off it takes {:.0f} ms (threads: {})."""
+KEPT = """Much of the plain step's time goes into fresh memory, which the C library returns after
+every large operation. With that turned off it takes {:.0f} ms (threads: {})."""
 TUNABLES = "glibc.malloc.mmap_max=0:glibc.malloc.trim_threshold=4294967296"
 PLAIN = """
 import json, sys

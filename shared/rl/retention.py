@@ -111,12 +111,7 @@ def discard(
         bits = threshold_bits(threshold_percent)
         recompute_marks(memory, config, bits, describe, version)
         threshold_percent = _next_threshold(memory, config, surplus, threshold_percent)
-    chosen, last_resort = [], 0
-    for action, count in surplus.items():
-        ids, by_age = _oldest_candidates(memory, action, count)
-        chosen.append(ids)
-        last_resort += by_age
-    removed = np.sort(np.concatenate(chosen))
+    removed, last_resort = _oldest_candidates(memory, surplus)
     memory.remove(removed)
     return Discard(removed, recomputed, last_resort, threshold_percent)
 
@@ -140,10 +135,18 @@ def _next_threshold(
     return percent
 
 
-def _oldest_candidates(memory: ReplayMemory, action: int, count: int) -> tuple[Ids, int]:
-    """`count` ids of one action: candidates first, each kind oldest first; how many were none."""
-    own = memory.rows["action"] == action
-    candidates = memory.ids[own & memory.rows["candidate"]]
-    others = memory.ids[own & ~memory.rows["candidate"]]
-    by_age = max(0, count - len(candidates))
-    return np.concatenate([candidates[:count], others[:by_age]]), by_age
+def _oldest_candidates(memory: ReplayMemory, surplus: dict[int, int]) -> tuple[Ids, int]:
+    """Ids to remove, ascending, and how many of them are no candidates.
+
+    So many of each action: candidates first, each kind oldest first.
+    """
+    # Each look at one field of the rows runs through all their bytes: look at each once.
+    ids, actions, marked = (memory.rows[name].copy() for name in ("id", "action", "candidate"))
+    chosen, last_resort = [], 0
+    for action, count in surplus.items():
+        own = actions == action
+        candidates = ids[own & marked][:count]
+        others = ids[own & ~marked][: count - len(candidates)]
+        chosen += [candidates, others]
+        last_resort += count - len(candidates)
+    return np.sort(np.concatenate(chosen)), last_resort
