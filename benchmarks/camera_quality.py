@@ -230,19 +230,17 @@ def name_of(run: Run) -> str:
 
 def runs_table(runs: Sequence[Run], random: Figures) -> str:
     """One row for each run, and one for the random policy."""
-    head = ["camera", "seed", *DRIVING.values(), *LEARNING.values(), "s"]
+    head = ["camera", "seed", *DRIVING.values(), *LEARNING.values()]
     rows: list[list[object]] = [
         [
             name_of(run),
             run["settings"]["seed"],
             *(run["driving"][name] for name in DRIVING),
             *(run["learning"][name] for name in LEARNING),
-            run["seconds"],
         ]
         for run in runs
     ]
-    blank = [None] * (len(LEARNING) + 1)
-    rows.append(["random", None, *(random[name] for name in DRIVING), *blank])
+    rows.append(["random", None, *(random[name] for name in DRIVING), *[None] * len(LEARNING)])
     return table(head, rows)
 
 
