@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
@@ -16,9 +17,9 @@ Mask = npt.NDArray[np.bool_]
 ROWS = 512
 """Rows compared at a time."""
 NEWER = 8 * ROWS
-"""Newer rows they are compared with at a time: bounds the memory to a few dozen megabytes."""
-STEP = 64
-"""Rows are filled up to a multiple of it: the library keeps memory for every shape it has met."""
+"""Newer rows they are compared with at a time, while there are so many; else again `ROWS`."""
+STEP = 128
+"""Open rows are filled up to a multiple of it."""
 
 
 def similar_to_newer(descriptors: Descriptors, bits: int, rule: Literal["paper", "cover"]) -> Mask:
@@ -28,11 +29,16 @@ def similar_to_newer(descriptors: Descriptors, bits: int, rule: Literal["paper",
     candidate or not; "cover" only with newer samples that are kept, so that everything dropped
     has a kept likeness (E23). Returns bool [n].
     """
-    signs = _signs(descriptors)
+    n = len(descriptors)
+    if not n:
+        return np.zeros(0, np.bool_)
+    # The library keeps half a megabyte for each shape of a product it has met: few shapes, by
+    # filling up to whole blocks. In front, so that nothing is compared with what fills up.
+    filled = -n % ROWS
+    signs = _signs(np.concatenate([descriptors[-1:].repeat(filled, axis=0), descriptors]))
     least_product = BITS - 2 * bits  # two descriptors at distance d have the product 120 - 2 d
-    if rule == "paper":
-        return _any_newer(signs, least_product)
-    return _uncovered(signs, least_product)
+    search = _any_newer if rule == "paper" else _uncovered
+    return search(signs, least_product)[filled:]
 
 
 def _signs(descriptors: Descriptors) -> Tensor:
@@ -54,20 +60,27 @@ def _any_newer(signs: Tensor, least_product: int) -> Mask:
         stop = min(start + ROWS, n)
         own = signs[start:stop] @ signs[start:stop].T >= least_product
         marked[start:stop] = own.triu(diagonal=1).any(dim=1).numpy()
-        for newer in range(stop, n, NEWER):
+        for newer in _pieces(stop, n):
             open_rows = start + np.flatnonzero(~marked[start:stop])
             if not len(open_rows):
                 break
             padded = np.resize(open_rows, _rounded_up(len(open_rows)))  # over again from the first
-            nearest = _largest_products(signs[torch.from_numpy(padded)], signs, newer, n)
+            nearest = _largest_products(signs[torch.from_numpy(padded)], signs[newer])
             marked[open_rows] = (nearest >= least_product)[: len(open_rows)]
     return marked
 
 
-def _largest_products(rows: Tensor, others: Tensor, start: int, end: int) -> npt.NDArray[np.int16]:
-    """The largest product of each row with others[start:start + NEWER], but not beyond `end`."""
-    products = rows @ others[start : min(start + NEWER, end)].T
-    return products.amax(dim=1).to(torch.int16).numpy()
+def _pieces(start: int, end: int) -> Iterator[slice]:
+    """All from `start` to `end`: large pieces while they last, then small ones."""
+    while start < end:
+        stop = start + (NEWER if end - start >= NEWER else ROWS)
+        yield slice(start, min(stop, end))
+        start = stop
+
+
+def _largest_products(rows: Tensor, others: Tensor) -> npt.NDArray[np.int16]:
+    """The largest product of each row with any of the others."""
+    return (rows @ others.T).amax(dim=1).to(torch.int16).numpy()
 
 
 def _rounded_up(count: int) -> int:
@@ -79,14 +92,13 @@ def _uncovered(signs: Tensor, least_product: int) -> Mask:
     n = len(signs)
     kept = np.zeros(n, np.bool_)
     # Filled up with the newest sample, which is always kept: comparing with it again is harmless.
-    kept_signs, count = signs[-1:].repeat(_rounded_up(n), 1), 0
+    kept_signs, count = signs[-1:].repeat(n + ROWS, 1), 0
     for stop in range(n, 0, -ROWS):
         start = max(stop - ROWS, 0)
         block = signs[start:stop]
         covered = np.zeros(len(block), np.bool_)
-        for other in range(0, count, NEWER):
-            nearest = _largest_products(block, kept_signs, other, _rounded_up(count))
-            covered |= nearest >= least_product
+        for newer in _pieces(0, -(-count // ROWS) * ROWS):
+            covered |= _largest_products(block, kept_signs[newer]) >= least_product
         own = (block @ block.T >= least_product).numpy()
         for row in range(len(block) - 1, -1, -1):
             inside = own[row, row + 1 :] & kept[start + row + 1 : stop]
