@@ -269,7 +269,9 @@ class Bus:
 
     def subscriber(self, key: str, callback: Any) -> None:
         """Declare a subscriber that lives as long as the bus."""
-        self._declared.append(self._session.declare_subscriber(key, callback))
+        self._declared.append(
+            self._session.declare_subscriber(key, zenoh.handlers.Callback(callback, indirect=False))
+        )
 
     def queryable(self, key: str, callback: Any) -> None:
         """Declare a queryable that lives as long as the bus."""

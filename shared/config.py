@@ -236,7 +236,8 @@ class Numerics(Section):
     pass does not stand it); auto: what is faster here, measured when the run first starts, then
     fixed in its folder."""
     batch: int = Field(default=32, ge=1, le=4096)
-    """Images per pass; inference pads to it so that results do not depend on company."""
+    """Images per pass; torch pads to it when predicting, so that results do not depend on company.
+    Those of openvino do not anyway: it takes passes as large as they come, up to 32."""
     cuda_batch: int = Field(default=2048, ge=1, le=65536)
     """Images per pass where the device is a GPU."""
 

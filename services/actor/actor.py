@@ -14,7 +14,7 @@ from shared.config import Config
 from shared.messages import Action, Episode, Observation, RobotProgress, image_array
 from shared.rl.draws import generator
 from shared.rl.episode import Ending, OpenEpisode, Release, Step, stale_steps, with_current_max_q
-from shared.rl.policy import choose, choose_uniformly
+from shared.rl.policy import Values, choose, choose_uniformly
 from shared.rl.predictor import Predictor
 from shared.rl.reward import episode_rewards
 
@@ -28,7 +28,9 @@ class Actor:
     """
 
     def __init__(self, config: Config, robot: str, life: str, predictor: Predictor) -> None:
-        self._config, self._robot, self._predictor = config, robot, predictor
+        self._config, self._robot = config, robot
+        self.predictor = predictor
+        """The target network that acts; replace it `at_boundary` only."""
         self.life = life
         self.open = OpenEpisode(config.episode)
         self.progress: RobotProgress | None = None
@@ -94,11 +96,16 @@ class Actor:
         self.submissions += 1
         self._unreported_samples = self._unreported_episodes = 0
 
-    def act(self, observation: Observation) -> Action:
-        """Choose an action with the current target network and append the step (A11, A26)."""
+    def act(self, observation: Observation, values: Values | None = None) -> Action:
+        """Choose an action with the current target network and append the step (A11, A26).
+
+        values: its clipped Q of all actions for this observation, float32 [3], where the caller
+        has already asked for them.
+        """
         assert self.progress is not None, "begin() comes first"
-        image = image_array(observation.image)
-        values = self._predictor.all_values(image[np.newaxis])[0]
+        if values is None:
+            image = image_array(observation.image)
+            values = self.predictor.all_values(image[np.newaxis])[0]
         number = len(self.open)
         if self.progress.filling:
             episode = self.progress.robot_fills
@@ -112,7 +119,7 @@ class Actor:
             action, greedy = choose_uniformly(draw), False
         else:
             action, greedy = choose(values, self._config.policy, draw)
-        version = self._predictor.version
+        version = self.predictor.version
         self.open.add(
             Step(
                 image=observation.image,
@@ -198,12 +205,12 @@ class Actor:
         self._unreported_episodes += episodes
 
     def _submission(self, release: Release, observation: Observation) -> Episode:
-        version = self._predictor.version
+        version = self.predictor.version
         stale = stale_steps(release, version)
         steps = release.steps
         if len(stale):
             images = np.stack([image_array(steps[i].image) for i in stale])
-            values = self._predictor.all_values(images)
+            values = self.predictor.all_values(images)
             steps = with_current_max_q(steps, values, stale, version)
         bump = release.ending == "bump"
         ahead = [step.max_q for step in steps[1 : release.count + 1]]

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections import defaultdict, deque
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from services.actor.actor import Actor
+from services.actor.targets import Targets
 from shared import statefile
 from shared.bus import Inbox
 from shared.codec import decode, encode
@@ -25,8 +28,10 @@ from shared.messages import (
     Observation,
     ProgressRequest,
     RobotProgress,
+    image_array,
 )
 from shared.numerics import settle
+from shared.rl.policy import Values
 from shared.rl.predictor import Predictor
 from shared.service import TICK_S, Service, Stopped, new_life, service
 from shared.weights import WeightsFetcher
@@ -72,12 +77,11 @@ class Session:
         path: Path,
         newest: Newest,
         weights: WeightsFetcher,
-        numerics: Numerics,
+        targets: Targets,
     ) -> None:
         self._me, self._robot, self._path = me, robot, path
-        self._newest, self._weights = newest, weights
-        self._predictor = Predictor(me.config.network, numerics)
-        self.actor = Actor(me.config, robot, new_life(), self._predictor)
+        self._newest, self._weights, self._targets = newest, weights, targets
+        self.actor = Actor(me.config, robot, new_life(), targets.none)
         self._pending: Episode | None = None
         """Finished, not yet acknowledged."""
         self._observation: Observation | None = None
@@ -113,18 +117,29 @@ class Session:
             if self.actor.progress is not None:
                 self._finish(observation)
 
-    def advance(self) -> None:
-        """Do what can be done now: hand over, wait for training, answer. Raises Stopped."""
+    def advance(self) -> Observation | None:
+        """Do what can be done now: hand over, wait for training. Raises Stopped.
+
+        Returns the observation that may be answered now, if there is one: see `answer`.
+        """
         if self._observation is None:
-            return
+            return None
         if self.actor.progress is None:
             self._begin(self._observation)
         if self._pending is not None:
             self._hand_over(self._pending)
         if self._may_act():
-            self._publish_answer(self._observation)
-        elif self._me.config.robot.timing == "realtime":
+            return self._observation
+        if self._me.config.robot.timing == "realtime":
             self._hold(self._observation)
+        return None
+
+    def answer(self, observation: Observation, values: Values) -> None:
+        """Act on what `advance` returned, given what `actor.predictor` says of its image."""
+        action = self.actor.act(observation, values)
+        self._answered = (self._place(observation), action)
+        self._observation = None
+        self._publish(action)
 
     def state(self) -> ActorState:
         """The heartbeat."""
@@ -139,7 +154,7 @@ class Session:
             phase=self._phase(progress),
             step=len(self.actor.open),
             robot_episode=progress.robot_episodes if progress else 0,
-            weights_version=self._predictor.version,
+            weights_version=self.actor.predictor.version,
             actions=self.actor.actions,
             actions_per_s=rate,
             stale_observations=self.stale_observations,
@@ -186,7 +201,7 @@ class Session:
 
     def _finish(self, observation: Observation) -> None:
         """End the open episode if this observation does. It needs the weights of the episode."""
-        if len(self.actor.open) and self._predictor.version == 0:
+        if len(self.actor.open) and self.actor.predictor.version == 0:
             self._load(*self._weights.wait_for(1))
         self._pending = self._pending or self.actor.finish(observation)
 
@@ -216,10 +231,10 @@ class Session:
             return False
         if self._lags(progress, learner):
             return False
-        if self.actor.at_boundary or self._predictor.version == 0:
+        if self.actor.at_boundary or self.actor.predictor.version == 0:
             self._load(*self._weights.newest)
             synchronous = self._me.config.learning.mode == "synchronous"
-            return self._predictor.version >= (learner.weights_version if synchronous else 1)
+            return self.actor.predictor.version >= (learner.weights_version if synchronous else 1)
         return True
 
     def _lags(self, progress: RobotProgress, learner: LearnerState) -> bool:
@@ -230,14 +245,8 @@ class Session:
 
     def _load(self, version: int, data: bytes) -> None:
         """Take up a target network, if it is newer."""
-        if version > self._predictor.version:
-            self._predictor.load(version, data)
-
-    def _publish_answer(self, observation: Observation) -> None:
-        action = self.actor.act(observation)
-        self._answered = (self._place(observation), action)
-        self._observation = None
-        self._publish(action)
+        if version > self.actor.predictor.version:
+            self.actor.predictor = self._targets.of(version, data)
 
     def _hold(self, observation: Observation) -> None:
         """Real time while the network trains: stand still for a period."""
@@ -252,7 +261,7 @@ class Session:
                 action=None,
                 greedy=False,
                 values=(0.0, 0.0, 0.0),
-                weights_version=self._predictor.version,
+                weights_version=self.actor.predictor.version,
             )
         )
 
@@ -279,7 +288,8 @@ class ActorLoop:
     """One thread: observations in, actions and episodes out."""
 
     def __init__(self, me: Service, folder: Path, numerics: Numerics) -> None:
-        self._me, self._folder, self._numerics = me, folder, numerics
+        self._me, self._folder = me, folder
+        self._targets = Targets(me.config.network, numerics)
         self._newest = Newest()
         self._sessions: dict[str, Session] = {}
         self._inbox: Inbox = me.bus.inbox()
@@ -300,9 +310,20 @@ class ActorLoop:
                     self._session(robot).offer(observation)
                 else:
                     self._inbox.refused[OBSERVATION.name] += 1
-            for session in self._sessions.values():
-                session.advance()
+            self._answer()
             self._beat()
+
+    def _answer(self) -> None:
+        """Let every robot's turn go on; images seen with the same weights share a pass."""
+        waiting: defaultdict[Predictor, list[tuple[Session, Observation]]] = defaultdict(list)
+        for session in self._sessions.values():
+            if (observation := session.advance()) is not None:
+                waiting[session.actor.predictor].append((session, observation))
+        for predictor, turns in waiting.items():
+            images = np.stack([image_array(observation.image) for _, observation in turns])
+            values = predictor.all_values(images)
+            for (session, observation), its_own in zip(turns, values, strict=True):
+                session.answer(observation, its_own)
 
     def save(self) -> None:
         """Save all robots' open episodes."""
@@ -313,7 +334,7 @@ class ActorLoop:
         if robot not in self._sessions:
             path = self._folder / f"{robot}.msgpack"
             self._sessions[robot] = Session(
-                self._me, robot, path, self._newest, self._weights, self._numerics
+                self._me, robot, path, self._newest, self._weights, self._targets
             )
             self._me.log.info("serving robot %r", robot)
         return self._sessions[robot]

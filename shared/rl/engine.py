@@ -29,7 +29,10 @@ Progress = Callable[[int, int], None]
 
 
 class Engine(Protocol):
-    """Runs one version of the network over any number of images, in passes of one size."""
+    """Runs one version of the network over any number of images.
+
+    What it says of an image is the same bits, whichever images come with it.
+    """
 
     def load(self, network: QNetwork) -> None:
         """Take over the network's parameters."""
@@ -42,7 +45,10 @@ class Engine(Protocol):
 
 
 class TorchEngine:
-    """PyTorch, on the CPU or on a GPU, where the outputs stay until the last pass is done."""
+    """PyTorch, on the CPU or on a GPU, where the outputs stay until the last pass is done.
+
+    Its bits depend on the number of images in a pass, so all passes have the same, padded.
+    """
 
     def __init__(self, numerics: Numerics) -> None:
         self._numerics = numerics
@@ -58,7 +64,7 @@ class TorchEngine:
         assert self._network is not None, "no weights are loaded"
         outputs = []
         with arithmetic(self._numerics), torch.inference_mode():
-            for part, count, done in passes(images, self._numerics.images_per_pass):
+            for part, count, done in padded(images, self._numerics.images_per_pass):
                 tensor = network_input(part, self._numerics.device)
                 maps = self._maps(self._network, tensor)
                 outputs.append(_output(self._network, maps, head)[:count])
@@ -108,15 +114,15 @@ def scaled(images: Tensor) -> Tensor:
     return channels_last.to(torch.float32).div_(255.0)
 
 
-def passes(images: Images, size: int) -> Iterator[tuple[Images, int, int]]:
+def padded(images: Images, size: int) -> Iterator[tuple[Images, int, int]]:
     """Parts of exactly `size` images, the last one padded; how many count, and all done so far."""
     for start in range(0, len(images), size):
         part = images[start : start + size]
         count = len(part)
         if count < size:
-            padded = np.zeros((size, IMAGE_HEIGHT, IMAGE_WIDTH), np.uint8)
-            padded[:count] = part
-            part = padded
+            filled = np.zeros((size, IMAGE_HEIGHT, IMAGE_WIDTH), np.uint8)
+            filled[:count] = part
+            part = filled
         yield part, count, start + count
 
 

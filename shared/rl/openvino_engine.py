@@ -12,22 +12,27 @@ import openvino as ov
 from openvino import opset13 as ops
 
 from shared.rl.descriptor import BLOCKS
-from shared.rl.engine import WIDTHS, Floats, Head, Images, Progress, passes
+from shared.rl.engine import WIDTHS, Floats, Head, Images, Progress
 from shared.rl.network import IMAGE_HEIGHT, IMAGE_WIDTH, MAP_WIDTH, QNetwork
 from shared.rl.policy import ACTIONS
 
 if TYPE_CHECKING:
     from shared.config import Numerics
 
+MOST = 32
+"""Images of one pass."""
 HINTS = {"float32": "f32", "bfloat16": "bf16"}
 Parameters = dict[str, Floats]
 
 
 class OpenVinoEngine:
-    """One compiled model with both heads; compiling takes some hundredths of a second."""
+    """One compiled model with both heads; compiling takes some hundredths of a second.
+
+    Its bits do not depend on the number of images in a pass: passes are as large as they come, up
+    to `MOST`, and `numerics.batch` plays no part.
+    """
 
     def __init__(self, numerics: Numerics) -> None:
-        self._batch = numerics.images_per_pass
         self._core = ov.Core()
         self._options = {
             "INFERENCE_PRECISION_HINT": HINTS[numerics.precision],
@@ -42,7 +47,7 @@ class OpenVinoEngine:
     def load(self, network: QNetwork) -> None:
         """Compile the network with its present parameters."""
         parameters = {name: t.detach().cpu().numpy() for name, t in network.state_dict().items()}
-        maps, images = _maps(parameters, network.pooled, self._batch)
+        maps, images = _maps(parameters, network.pooled)
         filters = len(parameters["conv4.bias"])
         outputs: dict[Head, ov.Output] = {
             "values": _values(maps, parameters, network.action_vectors.cpu().numpy())
@@ -60,17 +65,18 @@ class OpenVinoEngine:
             raise ValueError(f"filters must divide {BLOCKS} or be a multiple of it")
         outputs = np.empty((len(images), WIDTHS[head]), np.float32)
         place = self._heads.index(head)
-        for part, count, done in passes(images, self._batch):
+        for start in range(0, len(images), MOST):
+            part = images[start : start + MOST]
             self._request.infer([np.ascontiguousarray(part)], share_inputs=True)
-            outputs[done - count : done] = self._request.get_output_tensor(place).data[:count]
+            outputs[start : start + MOST] = self._request.get_output_tensor(place).data
             if progress is not None:
-                progress(done, len(images))
+                progress(start + len(part), len(images))
         return outputs
 
 
-def _maps(p: Parameters, pooled: tuple[bool, ...], batch: int) -> tuple[ov.Output, ov.Node]:
-    """MaxPool2 maps of a parameter uint8 [batch, 50, 75], and that parameter."""
-    images = ops.parameter([batch, IMAGE_HEIGHT, IMAGE_WIDTH], ov.Type.u8)
+def _maps(p: Parameters, pooled: tuple[bool, ...]) -> tuple[ov.Output, ov.Node]:
+    """MaxPool2 maps of a parameter uint8 [n, 50, 75], and that parameter."""
+    images = ops.parameter([-1, IMAGE_HEIGHT, IMAGE_WIDTH], ov.Type.u8)
     x = ops.unsqueeze(ops.convert(images, "f32"), _int(1))
     x = ops.divide(x, np.float32(255.0))
     for number, pools in enumerate(pooled, 1):
@@ -85,7 +91,7 @@ def _maps(p: Parameters, pooled: tuple[bool, ...], batch: int) -> tuple[ov.Outpu
 
 
 def _values(maps: ov.Output, p: Parameters, actions: Floats) -> ov.Output:
-    """Clipped values of all actions [batch, 3].
+    """Clipped values of all actions [n, 3].
 
     FConn3 multiplies state and action side by side: the action's part is the same for all images
     and computed here, once.
@@ -103,7 +109,7 @@ def _values(maps: ov.Output, p: Parameters, actions: Floats) -> ov.Output:
 
 
 def _sums(maps: ov.Output, filters: int) -> ov.Output:
-    """Sums of 16 blocks [batch, 16], as `descriptor.block_sums` takes them."""
+    """Sums of 16 blocks [n, 16], as `descriptor.block_sums` takes them."""
     if filters % BLOCKS == 0:
         blocks = ops.reshape(maps, np.array([0, BLOCKS, -1]), special_zero=True)
         return ops.reduce_sum(blocks, _int(2), keep_dims=False).output(0)

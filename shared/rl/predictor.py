@@ -7,6 +7,7 @@ threads, precision and batch are configuration (docs/architecture.md).
 
 from __future__ import annotations
 
+import copy
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,6 +30,7 @@ class Predictor:
         """Raises ValueError for unsettled numerics, ImportError for an engine not installed."""
         self.version = 0
         self.hash = ""
+        self._numerics = numerics
         self._network = QNetwork(network)
         self._engine = engine(numerics)
 
@@ -37,6 +39,13 @@ class Predictor:
         load_bytes(self._network, data)
         self._engine.load(self._network)
         self.version, self.hash = version, weights_hash(data)
+
+    def successor(self, version: int, data: bytes) -> Predictor:
+        """Another predictor, of `version`; this one stays what it is. Raises like `load`."""
+        other = copy.copy(self)  # the network is shared: weights only pass through it
+        other._engine = engine(self._numerics)
+        other.load(version, data)
+        return other
 
     def all_values(
         self, images: Images, progress: Progress | None = None
