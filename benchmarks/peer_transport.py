@@ -167,7 +167,9 @@ class OurSender:
             self._inbox.wait(0.2)
             for request in self._inbox.requests():
                 with request:
-                    for part in parts(self._state.weights_version, self._data):
+                    for part in parts(
+                        self._state.weights_version, self._data, self._state.weights_hash
+                    ):
                         request.reply(part)
 
 

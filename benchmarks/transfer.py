@@ -31,10 +31,10 @@ from services.learner.mirror import Mirror
 from services.monitor.up import free_endpoint
 from shared import settings
 from shared.bus import Bus, Inbox
-from shared.config import Config
+from shared.config import ActorNumerics, Config
 from shared.keys import EPISODE, LEARNER_STATE, REPLAY_STATE, WEIGHTS
 from shared.messages import EpisodeAck, LearnerState, ReplayState
-from shared.numerics import settle_all
+from shared.numerics import choose, settle_all
 from shared.rl.network import initialised, to_bytes, weights_hash
 from shared.weights import parts
 
@@ -47,13 +47,13 @@ import sys, time
 from shared.config import Config
 from shared.service import service
 from shared.weights import WeightsFetcher
-from shared.rl.predictor import Predictor
+from services.actor.targets import Targets
 config = Config.model_validate_json(sys.argv[1])
 with service("actor", "bench", config) as me:
-    predictor = Predictor(config.network, config.numerics.actor)
+    targets = Targets(config.network, config.numerics.actor)
     weights = WeightsFetcher(me, lambda: None)
     for version in range(1, int(sys.argv[2]) + 1):
-        predictor.load(*weights.wait_for(version))
+        predictor = targets.of(*weights.wait_for(version))
         print(predictor.version, time.monotonic(), flush=True)
 """
 
@@ -154,7 +154,7 @@ def _served(inbox: object, version: int, data: bytes, descriptor: int) -> float:
         inbox.wait(0.002)  # type: ignore[attr-defined]
         for request in inbox.requests():  # type: ignore[attr-defined]
             with request:
-                for part in parts(version, data):
+                for part in parts(version, data, weights_hash(data)):
                     request.reply(part)
         if select([descriptor], [], [], 0)[0]:
             said = os.read(descriptor, 200).split()
@@ -191,7 +191,7 @@ def learner(client: Bus, config: Config) -> Iterator[None]:
             inbox.wait(0.2)
             for request in inbox.requests():
                 with request:
-                    for part in parts(1, data):
+                    for part in parts(1, data, weights_hash(data)):
                         request.reply(part)
 
     thread = threading.Thread(target=serve)
@@ -235,6 +235,9 @@ def without_passes(mode: Mode) -> list[Bar]:
             "network": {"filters": filters},
         }
     )
+    actor = choose(config, ActorNumerics(engine="auto", precision="auto"), "actor")
+    numerics = config.numerics.model_copy(update={"actor": actor})
+    config = config.model_copy(update={"numerics": numerics})
     rounds, acks = rounds_of(mode, 5, 15), rounds_of(mode, 50, 200)
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / "run"

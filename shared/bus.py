@@ -268,10 +268,13 @@ class Bus:
         return Inbox(self)
 
     def subscriber(self, key: str, callback: Any) -> None:
-        """Declare a subscriber that lives as long as the bus."""
-        self._declared.append(
-            self._session.declare_subscriber(key, zenoh.handlers.Callback(callback, indirect=False))
-        )
+        """Declare a subscriber that lives as long as the bus.
+
+        The callback runs on Zenoh's own thread, one change of threads nearer to who waits for the
+        message: it must only enqueue.
+        """
+        direct = zenoh.handlers.Callback(callback, indirect=False)
+        self._declared.append(self._session.declare_subscriber(key, direct))
 
     def queryable(self, key: str, callback: Any) -> None:
         """Declare a queryable that lives as long as the bus."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from shared.errors import BadMessage, BusError, PeerSilent
 from shared.keys import LEARNER_STATE, WEIGHTS
 from shared.messages import LearnerState, Weights, WeightsRequest
-from shared.rl.network import weights_hash
+from shared.rl.network import WeightsHash
 from shared.service import TICK_S, Service, Stopped
 
 if TYPE_CHECKING:
@@ -21,25 +21,25 @@ RETRY_S = 0.05
 log = logging.getLogger(__name__)
 
 
-def parts(version: int, data: bytes) -> Iterator[Weights]:
-    """One version of the target network as messages of about 1 MB."""
+def parts(version: int, data: bytes, digest: str) -> Iterator[Weights]:
+    """One version of the target network as messages of about 1 MB; digest: its `weights_hash`."""
     chunks = [data[i : i + PART_BYTES] for i in range(0, len(data), PART_BYTES)]
     for part, chunk in enumerate(chunks):
-        yield Weights(
-            version=version, hash=weights_hash(data), part=part, parts=len(chunks), data=chunk
-        )
+        yield Weights(version=version, hash=digest, part=part, parts=len(chunks), data=chunk)
 
 
 def fetch(bus: Bus) -> tuple[int, bytes]:
     """The newest version and its safetensors bytes. Raises BusError or BadMessage."""
-    received = list(bus.request_many(WEIGHTS, WeightsRequest(), Weights))
+    received, digest = [], WeightsHash()
+    for message in bus.request_many(WEIGHTS, WeightsRequest(), Weights):
+        digest.add(message.data)  # while the next part is on its way
+        received.append(message)
     first = received[0]
-    data = b"".join(message.data for message in received)
     if [m.part for m in received] != list(range(first.parts)):
         raise PeerSilent(f"weights: expected {first.parts} parts, got {len(received)}")
-    if {(m.version, m.hash) for m in received} != {(first.version, weights_hash(data))}:
+    if {(m.version, m.hash) for m in received} != {(first.version, digest.text)}:
         raise BadMessage(f"weights: parts of version {first.version} do not match their hash")
-    return first.version, data
+    return first.version, b"".join(message.data for message in received)
 
 
 class WeightsFetcher(threading.Thread):

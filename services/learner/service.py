@@ -80,7 +80,7 @@ class LearnerLoop:
         """Answer requests, note what replay says, publish the heartbeat when due."""
         for request in self._inbox.requests():
             with request:
-                for part in parts(self._trainer.version, self._weights):
+                for part in parts(self._trainer.version, self._weights, self._hash):
                     request.reply(part)
         for _, state in self._inbox.take(REPLAY_STATE, ReplayState):
             self._known_turn = max(self._known_turn, state.turn)

@@ -18,6 +18,8 @@ PART_ROWS = 256
 class Feed(Tables):
     """Reading the memory for others, beside the threads that write it."""
 
+    _listed: tuple[int, list[int]] | None = None
+
     def changes(self, since: int, upto: int) -> Iterator[Change | FeedEnd]:
         """All changes in (since, upto] in parts of about 1 MB, then a `FeedEnd`."""
         with self._env.begin() as txn:
@@ -54,11 +56,17 @@ class Feed(Tables):
         """At most `size` samples without replacement, drawn by rank, with current rewards."""
         with self._env.begin() as txn:
             number = Position(**self._meta(txn, "position")).change
-            alive = self._alive(txn)
+            alive = self._alive_at(txn, number)
             ranks = draw.choice(len(alive), size=min(size, len(alive)), replace=False)
             rows, images = self._rows(txn, sorted(alive[rank] for rank in ranks))
             self._overlay_rewards(txn, rows)
             return _appended(number, True, rows, images)
+
+    def _alive_at(self, txn: Txn, number: int) -> list[int]:
+        """Insertion numbers after this change, kept for as long as nothing changes."""
+        if self._listed is None or self._listed[0] != number:
+            self._listed = number, self._alive(txn)
+        return self._listed[1]
 
     def _parts(self, txn: Txn, number: int, kind: str, what: Any) -> Iterator[Change]:
         if kind == "append":

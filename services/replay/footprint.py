@@ -10,8 +10,8 @@ TRIM_THRESHOLD, MMAP_THRESHOLD, ARENA_MAX = -1, -3, -8  # names of mallopt
 KEPT_BYTES = 512 * 1024 * 1024
 LARGEST_BYTES = 32 * 1024 * 1024
 """The most glibc lets come from the heap."""
-MOST_PAGES = 4096
-"""Pages of the file held at most, about: 16 MB."""
+MOST_PAGES = 1024
+"""Pages of the file held at most, about: 4 MB."""
 
 
 def gather_heap() -> None:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from shared.rl.descriptor import describe
 from shared.rl.engine import Engine, Progress, TorchEngine
-from shared.rl.network import QNetwork, load_bytes, weights_hash
+from shared.rl.network import QNetwork, load_bytes
 
 if TYPE_CHECKING:
     from shared.config import NetworkConfig, Numerics
@@ -29,7 +29,6 @@ class Predictor:
     def __init__(self, network: NetworkConfig, numerics: Numerics) -> None:
         """Raises ValueError for unsettled numerics, ImportError for an engine not installed."""
         self.version = 0
-        self.hash = ""
         self._numerics = numerics
         self._network = QNetwork(network)
         self._engine = engine(numerics)
@@ -38,7 +37,7 @@ class Predictor:
         """Become `version`, given as safetensors bytes. Raises ValueError if they do not fit."""
         load_bytes(self._network, data)
         self._engine.load(self._network)
-        self.version, self.hash = version, weights_hash(data)
+        self.version = version
 
     def successor(self, version: int, data: bytes) -> Predictor:
         """Another predictor, of `version`; this one stays what it is. Raises like `load`."""

@@ -479,6 +479,10 @@ def test_a_mini_batch_for_a_foreign_learner_has_current_rewards() -> None:
         assert batch.rewards == b.memory.rows["reward"][ranks].tobytes()
         assert batch.images == b.memory.images(ranks).tobytes()
         assert len(b.storage.mini_batch(999, generator(1, "test", 2)).ids) // 8 == len(b.memory)
+        b.commit(make_episode(20, seed=3, images=some_images(20, 3)))
+        b.turn()
+        later = b.storage.mini_batch(999, generator(1, "test", 2))
+        assert np.frombuffer(later.ids, "<u8").tolist() == b.memory.ids.tolist()
 
 
 # ------------------------------------------------------------------------- the mirror
