@@ -17,7 +17,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-full check lint unit system bench bench-full bench-peers clean
+.PHONY: help setup demo test test-full check lint unit system bench profile bench-full bench-peers clean
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
 
@@ -52,6 +52,9 @@ system: $(VENV)/.dev ## tests with real processes and a real router, without the
 
 bench: $(VENV)/.dev ## measure speed and memory, in minutes; the machine should do nothing else
 	$(BIN)/python -m benchmarks.run_all --short
+
+profile: $(VENV)/.dev ## measure where a step spends its time, part by part and process by process
+	$(BIN)/python -m benchmarks.step_profile
 
 bench-full: $(VENV)/.dev ## the same with all images and rounds, in hours at most
 	$(BIN)/python -m benchmarks.run_all

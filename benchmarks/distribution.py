@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
 
@@ -32,6 +32,7 @@ from shared.numerics import choose
 
 WARM_UP_STEPS = 100
 PATIENCE_S = 600.0
+POLL_S = 0.1
 
 
 def configuration(filters: int = 64) -> Config:
@@ -75,9 +76,11 @@ def system_rate(config: Config, steps: int, robots: int) -> float:
         specs += [more_robots(specs, f"robotino{i}") for i in range(2, robots + 1)]
         (folder / "logs").mkdir(exist_ok=True)
         with Supervisor(specs, folder / "logs", dict(os.environ), []), connected(config) as client:
-            inbox = client.inbox()
-            inbox.subscribe(OBSERVATION)
-            return measured(inbox, steps, robots)
+            counted = Steps(client.inbox())
+            counted.reach(WARM_UP_STEPS, robots)
+            start_s, before = time.perf_counter(), counted.look()
+            counted.reach_in_all(before + steps)
+            return (counted.look() - before) / (time.perf_counter() - start_s)
 
 
 def more_robots(specs: list[ChildSpec], robot: str) -> ChildSpec:
@@ -98,26 +101,35 @@ def connected(config: Config) -> Bus:
                 raise
 
 
-def measured(inbox: Inbox, steps: int, robots: int) -> float:
-    """Executed actions of all robots per second, from the observations' numbers."""
-    newest: dict[str, int] = {}
+class Steps:
+    """Executed actions of all robots, from the numbers of their observations."""
 
-    def look() -> int:
-        inbox.wait(0.05)
-        for robot, seen in inbox.take(OBSERVATION, Observation):
-            newest[robot] = seen.sequence
-        return sum(newest.values())
+    def __init__(self, inbox: Inbox) -> None:
+        self._inbox, self._newest = inbox, dict[str, int]()
+        self._deadline_s = time.monotonic() + PATIENCE_S
+        inbox.subscribe(OBSERVATION)
 
-    deadline_s = time.monotonic() + PATIENCE_S
-    while len(newest) < robots or min(newest.values()) < WARM_UP_STEPS:
-        look()
-        if time.monotonic() > deadline_s:
-            raise TimeoutError(f"only {sorted(newest.items())} came to drive")
-    start_s, before = time.perf_counter(), look()
-    while (now := look()) - before < steps:
-        if time.monotonic() > deadline_s:
-            raise TimeoutError(f"{now - before} of {steps} steps within {PATIENCE_S:.0f} s")
-    return (now - before) / (time.perf_counter() - start_s)
+    def look(self) -> int:
+        """Actions of all robots so far."""
+        for robot, seen in self._inbox.take(OBSERVATION, Observation):
+            self._newest[robot] = seen.sequence
+        return sum(self._newest.values())
+
+    def reach(self, each: int, robots: int) -> None:
+        """Return when every one of so many robots has executed `each` actions."""
+        self._poll(lambda: len(self._newest) == robots and min(self._newest.values()) >= each)
+
+    def reach_in_all(self, count: int) -> None:
+        """Return when all robots together have executed `count` actions."""
+        self._poll(lambda: sum(self._newest.values()) >= count)
+
+    def _poll(self, done: Callable[[], bool]) -> None:
+        """Look a few times a second: who watches every step takes time from those who make it."""
+        while not done():
+            if time.monotonic() > self._deadline_s:
+                raise TimeoutError(f"no more than {self._newest} steps in {PATIENCE_S:.0f} s")
+            time.sleep(POLL_S)
+            self.look()
 
 
 def measure(mode: Mode) -> tuple[list[list[object]], list[Bar]]:

@@ -25,7 +25,6 @@ from benchmarks.peers import NOT_INSTALLED
 
 HERE = Path(__file__).parent
 RESULTS, PAGE = HERE / "results.json", ROOT / "docs" / "performance.md"
-MARK = re.compile(r"(<!-- measured -->\n).*?(<!-- end -->)", re.DOTALL)
 NOTHING = "Nothing measured yet."
 Entry = dict[str, Any]
 """What running one script gave: command, mode, when, seconds, machine, error, bars."""
@@ -116,9 +115,10 @@ def write(entries: dict[str, Entry]) -> None:
         PAGE.write_text(renewed(PAGE.read_text(), text))
 
 
-def renewed(page: str, text: str) -> str:
+def renewed(page: str, text: str, mark: str = "measured") -> str:
     """A page with this text between its marks."""
-    return MARK.sub(lambda found: f"{found[1]}\n{text}\n\n{found[2]}", page)
+    between = re.compile(rf"(<!-- {mark} -->\n).*?(<!-- end -->)", re.DOTALL)
+    return between.sub(lambda found: f"{found[1]}\n{text}\n\n{found[2]}", page)
 
 
 def rendered(entries: dict[str, Entry]) -> str:
