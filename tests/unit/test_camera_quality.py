@@ -34,7 +34,7 @@ def test_last_line_of_the_script_is_its_bar(capsys: pytest.CaptureFixture[str]) 
     assert [bar["id"] for bar in bars] == ["P6c"]
     assert bars[0]["n"] == len(CHECK.seeds)
     assert (bars[0]["better"], bars[0]["required"], bars[0]["aim"]) == ("lower", 1.25, 1.0)
-    parts = ("bumps_per_1000", "distance", "laps", "nowhere")
+    parts = ("bumps_per_1000", "least", "most", "distance", "laps", "nowhere")
     names = {f"{part}_{width}" for part in parts for width in (75, 150)}
     assert bars[0]["checks"].keys() == names | {"bumps_per_1000_random"}
 
