@@ -57,7 +57,7 @@ class Sizes:
 
 SIZES: dict[Mode, Sizes] = {
     "check": Sizes(4, 900, 1, 0, 900, 50, 50, 1),
-    "short": Sizes(64, 45_000, 2, 0, 2000, 4000, 4000, 4),
+    "short": Sizes(64, 45_000, 1, 0, 2000, 4000, 4000, 4),
     "full": Sizes(64, 45_000, 4, 3, 2000, 20_000, 100_000, 4),
 }
 
@@ -141,7 +141,7 @@ def full_use(mode: Mode) -> list[Look]:
     with tempfile.TemporaryDirectory() as place:
         folder = prepared(Path(place) / "run", config, mode)
         with system(config, folder) as supervisor:
-            return watched(config, supervisor, done, every_s=0.2)
+            return watched(config, supervisor, done, every_s=0.25)
 
 
 def long_use(mode: Mode) -> list[Look]:
