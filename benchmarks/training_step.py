@@ -131,7 +131,20 @@ def gradient_cosines(mode: Mode) -> dict[tuple[str, str], float]:
         for precision in ("float32", "bfloat16"):
             found = [cosine(mode, precision, data, mini_batch(mode, i)) for i in range(draws)]
             cosines[precision, weights] = min(found)
+        found = [autocast_cosine(mode, data, mini_batch(mode, i)) for i in range(draws)]
+        cosines["bfloat16 forward too", weights] = min(found)
     return cosines
+
+
+def autocast_cosine(mode: Mode, weights: bytes, ranks: Ranks) -> float:
+    """Cosine of the gradient that PyTorch's autocast gives: what training in bfloat16 would be."""
+    config = frames.network_config(mode)
+    exact = plain.Step(config, LearningConfig(), weights, threads=1)
+    rounded = plain.Step(config, LearningConfig(), weights, threads=1)
+    exact(frames.samples(mode), ranks)
+    with torch.autocast("cpu", torch.bfloat16):
+        rounded(frames.samples(mode), ranks)
+    return between(gradient(exact.network), gradient(rounded.network))
 
 
 def cosine(mode: Mode, precision: str, weights: bytes, ranks: Ranks) -> float:
@@ -143,8 +156,12 @@ def cosine(mode: Mode, precision: str, weights: bytes, ranks: Ranks) -> float:
     load_bytes(trainer.train_network, weights)
     naive(store, ranks)
     trainer.step(store, ranks)
-    reference, own = gradient(naive.network), gradient(trainer.train_network)
-    return float(own @ reference / (own.norm() * reference.norm()))
+    return between(gradient(naive.network), gradient(trainer.train_network))
+
+
+def between(one: torch.Tensor, other: torch.Tensor) -> float:
+    """The cosine of two vectors."""
+    return float(one @ other / (one.norm() * other.norm()))
 
 
 def mini_batch(mode: Mode, number: int = 0) -> Ranks:

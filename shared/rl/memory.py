@@ -43,8 +43,8 @@ SAMPLE = np.dtype(
 )
 BLOCK = 4096
 """Images per block: the store grows and shrinks by blocks and is never copied as a whole."""
-PART = 1024
-"""Images looked at together in a pass over the memory."""
+PART = 2048
+"""Images looked at together in a pass over the memory: what a GPU takes at once, too."""
 
 
 class SampleStore:
