@@ -6,7 +6,7 @@ import importlib.util
 from pathlib import Path
 
 NOT_INSTALLED = 69
-"""Exit code of a script whose peers are missing; what it found earlier then stays as it is."""
+"""Exit code of a script whose peers, or whose GPU, are missing: its earlier results stay."""
 
 
 def require(script: str, *modules: str) -> None:

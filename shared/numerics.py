@@ -68,14 +68,15 @@ def choose(config: Config, wanted: Numerics, role: Role) -> Numerics:
 
     Threads: while the learner trains synchronously nobody else works, so it takes all cores (at
     most 8), and so does replay for its passes; everything else stays with one, because two busy
-    processes that share cores slow each other down far more than a second thread helps.
+    processes that share cores slow each other down far more than a second thread helps, and a GPU
+    is fed by one.
     """
     threads, device = wanted.threads, wanted.device
-    if not threads:
-        alone = config.learning.mode == "synchronous" and role != "actor"
-        threads = min(len(os.sched_getaffinity(0)), 8) if alone else 1
     if device == "auto":
         device = "cuda" if _has_gpu() else "cpu"
+    if not threads:
+        alone = config.learning.mode == "synchronous" and role != "actor"
+        threads = min(len(os.sched_getaffinity(0)), 8) if alone and device == "cpu" else 1
     placed = _installed(wanted.model_copy(update={"threads": threads, "device": device}))
     candidates = _candidates(placed)
     if len(candidates) == 1:

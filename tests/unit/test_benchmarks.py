@@ -19,6 +19,7 @@ SCRIPTS = {
     "choose_action": ["P2a", "P2b", "P2c"],
     "bulk_pass": ["P3a", "P3b", "P3c"],
     "candidate_search": ["P4a", "P4b", "P4c", "P4d"],
+    "gpu": ["P9a", "P9b", "P9c", "P9d"],
     "growth": ["P11a", "P11b"],
 }
 

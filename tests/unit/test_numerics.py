@@ -99,10 +99,11 @@ def test_a_gpu_is_taken_where_there_is_one(
     gpu: bool, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(numerics, "_has_gpu", lambda: gpu)
-    wanted = LearnerNumerics(device="auto")
+    wanted = LearnerNumerics(device="auto", threads=0)
     assert not wanted.settled
     chosen = numerics.choose(OPEN, wanted, "learner")
     assert (chosen.device, chosen.settled) == (device, True)
+    assert chosen.threads == 1 or not gpu
     assert chosen.images_per_pass == (2048 if gpu else wanted.batch)
 
 
