@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict, deque
+from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,18 +13,18 @@ from typing import Any, Literal
 import numpy as np
 
 from services.actor.actor import Actor
+from services.actor.courier import Courier, Delivery
 from services.actor.targets import Targets
 from shared import statefile
 from shared.bus import Inbox
 from shared.codec import decode, encode
 from shared.config import Config, Numerics
 from shared.errors import BadMessage, StateError
-from shared.keys import ACTION, ACTOR_STATE, EPISODE, LEARNER_STATE, OBSERVATION, PROGRESS
+from shared.keys import ACTION, ACTOR_STATE, LEARNER_STATE, OBSERVATION, PROGRESS
 from shared.messages import (
     Action,
     ActorState,
     Episode,
-    EpisodeAck,
     LearnerState,
     Observation,
     ProgressRequest,
@@ -78,14 +79,19 @@ class Session:
         newest: Newest,
         weights: WeightsFetcher,
         targets: Targets,
+        courier: Courier,
     ) -> None:
         self._me, self._robot, self._path = me, robot, path
         self._newest, self._weights, self._targets = newest, weights, targets
+        self._courier = courier
+        self._delivery: Future[Delivery] | None = None
         self.actor = Actor(me.config, robot, new_life(), targets.none)
         self._pending: Episode | None = None
         """Finished, not yet acknowledged."""
         self._observation: Observation | None = None
         """Waits for its action."""
+        self._finished: Observation | None = None
+        """The newest observation that was asked whether it ends the open episode."""
         self._answered: tuple[tuple[str, int, int], Action] | None = None
         self._life = ""
         self._past_lives: deque[str] = deque(maxlen=100)
@@ -126,8 +132,10 @@ class Session:
             return None
         if self.actor.progress is None:
             self._begin(self._observation)
-        if self._pending is not None:
-            self._hand_over(self._pending)
+        while self._pending is not None:
+            if not self._handed_over(self._pending):
+                return None
+            self._finish(self._observation)  # it may have come meanwhile
         if self._may_act():
             return self._observation
         if self._me.config.robot.timing == "realtime":
@@ -200,26 +208,30 @@ class Session:
         return self._me.bus.request(PROGRESS, request, RobotProgress)
 
     def _finish(self, observation: Observation) -> None:
-        """End the open episode if this observation does. It needs the weights of the episode."""
+        """End the open episode if this observation ends it. It needs the weights of the episode.
+
+        Once for each observation, and not before the episode that ended last is handed over.
+        """
+        if self._pending is not None or self._finished is observation:
+            return
         if len(self.actor.open) and self.actor.predictor.version == 0:
             self._load(*self._weights.wait_for(1))
-        self._pending = self._pending or self.actor.finish(observation)
+        self._pending, self._finished = self.actor.finish(observation), observation
 
-    def _hand_over(self, episode: Episode) -> None:
-        """Send the episode until it is acknowledged: then it is on disk, exactly once."""
-        sent = 0
-
-        def attempt() -> EpisodeAck:
-            nonlocal sent
-            sent += 1
-            return self._me.bus.request(EPISODE, episode, EpisodeAck)
-
-        ack = self._me.insist("hand an episode to replay", attempt)
-        self.resent_episodes += sent - 1
+    def _handed_over(self, episode: Episode) -> bool:
+        """Whether the episode is acknowledged: then it is on disk, exactly once. Raises Stopped."""
+        if self._delivery is None:
+            self._delivery = self._courier.send(episode)
+        if not self._delivery.done():
+            return False
+        delivered, self._delivery = self._delivery.result(), None
+        ack = delivered.ack
+        self.resent_episodes += delivered.attempts - 1
         if not ack.accepted or ack.progress is None:
             raise StateError(f"replay refused episode {episode.number}: {ack.reason}")
         self.actor.committed(ack.progress)
         self._pending = None
+        return True
 
     def _may_act(self) -> bool:
         """Whether the next action may be chosen now; loads the weights it needs."""
@@ -296,6 +308,7 @@ class ActorLoop:
         self._inbox.subscribe(OBSERVATION)
         self._inbox.subscribe(LEARNER_STATE, "main")
         self._weights = WeightsFetcher(me, self._inbox.wake)
+        self._courier = Courier(me, self._inbox.wake)
         me.stop.on_set(self._inbox.wake)
         self._next_beat_s = 0.0
 
@@ -334,7 +347,7 @@ class ActorLoop:
         if robot not in self._sessions:
             path = self._folder / f"{robot}.msgpack"
             self._sessions[robot] = Session(
-                self._me, robot, path, self._newest, self._weights, self._targets
+                self._me, robot, path, self._newest, self._weights, self._targets, self._courier
             )
             self._me.log.info("serving robot %r", robot)
         return self._sessions[robot]
