@@ -28,6 +28,7 @@ SERVICES = ("router", "driver", "actor", "replay", "learner")
 FOREIGN = {
     "pybullet": "pybullet",
     "opencv-python-headless": "cv2",
+    "openvino": "openvino",
     "torch": "torch",
     "safetensors": "safetensors",
     "lmdb": "lmdb",
@@ -70,7 +71,8 @@ def extras(stage: str) -> set[str]:
     found: set[str] = set()
     while stage in stages():
         stage, text = stages()[stage]
-        found |= set(re.findall(r"'\.\[(\w+)\]'", text))
+        for names in re.findall(r"'\.\[([\w,]+)\]'", text):
+            found |= set(names.split(","))
     return found
 
 
@@ -107,7 +109,9 @@ def test_images_are_small_where_they_can_be() -> None:
     assert distributions(extras("router-env")) == set()
     assert "torch" not in distributions(extras("driver-env"))
     for name in ("actor", "replay", "learner"):
-        assert "pybullet" not in distributions(extras(f"{name}-env"))
+        held = distributions(extras(f"{name}-env"))
+        assert "pybullet" not in held
+        assert ("openvino" in held) == (name != "learner")  # it predicts nothing
 
 
 @pytest.mark.parametrize("name", SERVICES)
@@ -174,7 +178,7 @@ def test_all_services_get_the_same_valid_configuration(
             environment.update(more)
         config = settings.load(preset=tree["command"][2], env=environment)
         assert config.bus.endpoint == "tcp/router:7447"
-        assert config.numerics.learner.device == ("cuda" if gpu else "cpu")
+        assert config.numerics.learner.device == ("cuda" if gpu else "auto")
         found.add(config.fingerprint())
     assert len(found) == 1
 
