@@ -3,41 +3,27 @@
 from __future__ import annotations
 
 import time
-from collections import defaultdict, deque
-from concurrent.futures import Future
+from collections import defaultdict
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 
-from services.actor.actor import Actor
-from services.actor.courier import Courier, Delivery
+from services.actor.courier import Courier
+from services.actor.session import Newest, Session
 from services.actor.targets import Targets
-from shared import statefile
 from shared.bus import Inbox
-from shared.codec import decode, encode
 from shared.config import Config, Numerics
-from shared.errors import BadMessage, StateError
-from shared.keys import ACTION, ACTOR_STATE, LEARNER_STATE, OBSERVATION, PROGRESS
+from shared.keys import ACTOR_STATE, LEARNER_STATE, OBSERVATION
 from shared.messages import (
-    Action,
-    ActorState,
-    Episode,
     LearnerState,
     Observation,
-    ProgressRequest,
-    RobotProgress,
     image_array,
 )
 from shared.numerics import settle
-from shared.rl.policy import Values
 from shared.rl.predictor import Predictor
-from shared.service import TICK_S, Service, Stopped, new_life, service
+from shared.service import TICK_S, Service, Stopped, service
 from shared.weights import WeightsFetcher
-
-Phase = Literal["waiting", "filling", "driving", "handing-over", "training", "stopped"]
 
 MAX_ROBOTS = 32
 """Robots one actor serves; observations of more are refused and counted."""
@@ -50,250 +36,6 @@ def run(config: Config, folder: Path) -> None:
         with suppress(Stopped):
             loop.run()
         loop.save()  # not after a crash: what led to it must not come back
-
-
-@dataclass
-class Newest:
-    """The newest announcement of the learner."""
-
-    state: LearnerState | None = None
-
-    def note(self, state: LearnerState) -> None:
-        """Take over a state unless it is older: neither number ever falls, so it came late."""
-        known = self.state
-        if known is None or (state.episode, state.weights_version) >= (
-            known.episode,
-            known.weights_version,
-        ):
-            self.state = state
-
-
-class Session:
-    """One robot: its actor, and where the hand-over of its last episode stands."""
-
-    def __init__(
-        self,
-        me: Service,
-        robot: str,
-        path: Path,
-        newest: Newest,
-        weights: WeightsFetcher,
-        targets: Targets,
-        courier: Courier,
-    ) -> None:
-        self._me, self._robot, self._path = me, robot, path
-        self._newest, self._weights, self._targets = newest, weights, targets
-        self._courier = courier
-        self._delivery: Future[Delivery] | None = None
-        self.actor = Actor(me.config, robot, new_life(), targets.none)
-        self._pending: Episode | None = None
-        """Finished, not yet acknowledged."""
-        self._observation: Observation | None = None
-        """Waits for its action."""
-        self._finished: Observation | None = None
-        """The newest observation that was asked whether it ends the open episode."""
-        self._answered: tuple[tuple[str, int, int], Action] | None = None
-        self._life = ""
-        self._past_lives: deque[str] = deque(maxlen=100)
-        """Driver processes that are gone: what still comes of them is late."""
-        self.stale_observations = 0
-        self.resent_episodes = 0
-        self._counted = (time.monotonic(), 0)
-        saved = statefile.take(path)
-        if saved is not None:
-            self._restore(saved)
-
-    def offer(self, observation: Observation) -> None:
-        """Take an observation from the inbox: new, repeated, or outdated."""
-        place = (observation.life, observation.sequence, observation.attempt)
-        if self._answered is not None and self._answered[0] == place:
-            self._publish(self._answered[1])  # our answer was lost
-            return
-        if self._answered and self._answered[0][0] == place[0] and place < self._answered[0]:
-            self.stale_observations += 1
-            return
-        if observation.life in self._past_lives:
-            self.stale_observations += 1
-            return
-        if self._life and observation.life != self._life:
-            self._past_lives.append(self._life)
-        self._life = observation.life
-        if self._observation is None or place != self._place(self._observation):
-            self._observation = observation
-            if self.actor.progress is not None:
-                self._finish(observation)
-
-    def advance(self) -> Observation | None:
-        """Do what can be done now: hand over, wait for training. Raises Stopped.
-
-        Returns the observation that may be answered now, if there is one: see `answer`.
-        """
-        if self._observation is None:
-            return None
-        if self.actor.progress is None:
-            self._begin(self._observation)
-        while self._pending is not None:
-            if not self._handed_over(self._pending):
-                return None
-            self._finish(self._observation)  # it may have come meanwhile
-        if self._may_act():
-            return self._observation
-        if self._me.config.robot.timing == "realtime":
-            self._hold(self._observation)
-        return None
-
-    def answer(self, observation: Observation, values: Values) -> None:
-        """Act on what `advance` returned, given what `actor.predictor` says of its image."""
-        action = self.actor.act(observation, values)
-        self._answered = (self._place(observation), action)
-        self._observation = None
-        self._publish(action)
-
-    def state(self) -> ActorState:
-        """The heartbeat."""
-        now_s, (then_s, count) = time.monotonic(), self._counted
-        rate = (self.actor.actions - count) / max(now_s - then_s, 1e-6)
-        self._counted = (now_s, self.actor.actions)
-        progress, action = self.actor.progress, self._answered[1] if self._answered else None
-        return ActorState(
-            id="main",
-            life=self.actor.life,
-            robot=self._robot,
-            phase=self._phase(progress),
-            step=len(self.actor.open),
-            robot_episode=progress.robot_episodes if progress else 0,
-            weights_version=self.actor.predictor.version,
-            actions=self.actor.actions,
-            actions_per_s=rate,
-            stale_observations=self.stale_observations,
-            dropped_samples=self.actor.dropped_samples,
-            dropped_episodes=self.actor.dropped_episodes,
-            resent_episodes=self.resent_episodes,
-            undecodable=0,
-            values=action.values if action else (0.0, 0.0, 0.0),
-        )
-
-    def save(self) -> None:
-        """Save the open episode and what is not yet acknowledged."""
-        state = {"actor": self.actor.state(), "resent_episodes": self.resent_episodes}
-        if self._pending is not None:
-            state["pending"] = encode(self._pending)
-        if self._answered is not None:
-            state["answered"] = [list(self._answered[0]), encode(self._answered[1])]
-        statefile.save(self._path, state)
-
-    def _restore(self, saved: dict[str, Any]) -> None:
-        try:
-            self.actor.restore(saved["actor"])
-            self.resent_episodes = int(saved["resent_episodes"])
-            if "pending" in saved:
-                self._pending = decode(saved["pending"], Episode)
-            if "answered" in saved:
-                (life, sequence, attempt), answer = saved["answered"]
-                self._answered = ((life, sequence, attempt), decode(answer, Action))
-        except (KeyError, TypeError, ValueError, BadMessage) as error:
-            raise StateError(f"{self._path}: saved actor state does not fit: {error}") from error
-
-    def _begin(self, observation: Observation) -> None:
-        """Learn from replay where this robot was, and load weights."""
-        progress = self._me.insist("ask replay for the robot's progress", self._ask_progress)
-        if self._pending is None:
-            self.actor.begin(progress, observation)
-            self._finish(observation)
-        else:
-            self.actor.progress = progress
-
-    def _ask_progress(self) -> RobotProgress:
-        request = ProgressRequest(robot=self._robot)
-        return self._me.bus.request(PROGRESS, request, RobotProgress)
-
-    def _finish(self, observation: Observation) -> None:
-        """End the open episode if this observation ends it. It needs the weights of the episode.
-
-        Once for each observation, and not before the episode that ended last is handed over.
-        """
-        if self._pending is not None or self._finished is observation:
-            return
-        if len(self.actor.open) and self.actor.predictor.version == 0:
-            self._load(*self._weights.wait_for(1))
-        self._pending, self._finished = self.actor.finish(observation), observation
-
-    def _handed_over(self, episode: Episode) -> bool:
-        """Whether the episode is acknowledged: then it is on disk, exactly once. Raises Stopped."""
-        if self._delivery is None:
-            self._delivery = self._courier.send(episode)
-        if not self._delivery.done():
-            return False
-        delivered, self._delivery = self._delivery.result(), None
-        ack = delivered.ack
-        self.resent_episodes += delivered.attempts - 1
-        if not ack.accepted or ack.progress is None:
-            raise StateError(f"replay refused episode {episode.number}: {ack.reason}")
-        self.actor.committed(ack.progress)
-        self._pending = None
-        return True
-
-    def _may_act(self) -> bool:
-        """Whether the next action may be chosen now; loads the weights it needs."""
-        progress, learner = self.actor.progress, self._newest.state
-        limit = self._me.config.run.episodes
-        if progress is None or learner is None:
-            return False
-        if limit and progress.episode >= limit and not progress.filling:
-            return False
-        if self._lags(progress, learner):
-            return False
-        if self.actor.at_boundary or self.actor.predictor.version == 0:
-            self._load(*self._weights.newest)
-            synchronous = self._me.config.learning.mode == "synchronous"
-            return self.actor.predictor.version >= (learner.weights_version if synchronous else 1)
-        return True
-
-    def _lags(self, progress: RobotProgress, learner: LearnerState) -> bool:
-        """Whether the learner is farther behind than the robot may drive on."""
-        learning = self._me.config.learning
-        allowed = 0 if learning.mode == "synchronous" else learning.max_lag_episodes
-        return progress.episode - learner.episode > allowed
-
-    def _load(self, version: int, data: bytes) -> None:
-        """Take up a target network, if it is newer."""
-        if version > self.actor.predictor.version:
-            self.actor.predictor = self._targets.of(version, data)
-
-    def _hold(self, observation: Observation) -> None:
-        """Real time while the network trains: stand still for a period."""
-        self._observation = None
-        self._publish(
-            Action(
-                robot=self._robot,
-                actor_life=self.actor.life,
-                robot_life=observation.life,
-                sequence=observation.sequence,
-                attempt=observation.attempt,
-                action=None,
-                greedy=False,
-                values=(0.0, 0.0, 0.0),
-                weights_version=self.actor.predictor.version,
-            )
-        )
-
-    def _publish(self, action: Action) -> None:
-        self._me.bus.publish(ACTION, action, self._robot)
-
-    def _place(self, observation: Observation) -> tuple[str, int, int]:
-        return (observation.life, observation.sequence, observation.attempt)
-
-    def _phase(self, progress: RobotProgress | None) -> Phase:
-        if self._me.stop.is_set():
-            return "stopped"
-        if progress is None:
-            return "waiting"
-        if self._pending is not None:
-            return "handing-over"
-        learner = self._newest.state
-        if self._observation is not None and learner and self._lags(progress, learner):
-            return "training"
-        return "filling" if progress.filling else "driving"
 
 
 class ActorLoop:
