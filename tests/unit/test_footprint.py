@@ -34,8 +34,6 @@ thread.start()
 thread.join()
 """
 
-pytestmark = pytest.mark.skipif(not SMAPS.exists(), reason="needs /proc")
-
 
 def held_kb(path: Path) -> int:
     """Pages of a mapped file that this process holds."""
