@@ -1,7 +1,7 @@
 """Inference with fixed arithmetic: what a role predicts does not depend on who else asks.
 
-Images are processed in passes of exactly `numerics.images_per_pass`, the last one padded, so that
-the value of an image at one place of a pass is the same bits whoever shares the pass; engine,
+The value of an image is the same bits whoever shares its pass. How an engine achieves that, by
+padding all passes to one size or by its nature, is its own business (`shared.rl.engine`); engine,
 threads, precision and batch are configuration (docs/architecture.md).
 """
 
