@@ -217,6 +217,9 @@ class LearningConfig(Section):
     fit_every: int = Field(default=100, ge=0)
     """Episodes between fitting phases; 0 never."""
     fit_epochs: int = Field(default=3, ge=1, le=1000)
+    augmentation: Literal["none", "mirror"] = "none"
+    """mirror: half of all samples, by chance, train mirrored, left for right: what is learnt in
+    one direction of a corridor then helps in the other."""
     target_rule: Literal["bump", "episode"] = "episode"
     """Copy train to target after episodes with a bump (paper, A26) or after every one (E15)."""
 

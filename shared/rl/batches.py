@@ -10,8 +10,12 @@ import torch
 from torch import Tensor
 
 from shared.rl.memory import SampleStore
+from shared.rl.policy import FORWARD, FORWARD_LEFT, FORWARD_RIGHT
 
 Ranks = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
+MIRRORED = (FORWARD, FORWARD_RIGHT, FORWARD_LEFT)
+"""The actions, as seen in a mirror."""
 
 
 class Batch(NamedTuple):
@@ -20,6 +24,17 @@ class Batch(NamedTuple):
     images: Tensor
     actions: Tensor
     rewards: Tensor
+
+    def mirrored(self, which: Tensor) -> Batch:
+        """The batch with some samples, bool [k], seen in a mirror: left is right, rewards stay.
+
+        The robot and its three actions are symmetrical, so what it would have got in the mirrored
+        corridor is known.
+        """
+        images = torch.where(which[:, None, None], self.images.flip(-1), self.images)
+        sides = torch.tensor(MIRRORED, device=self.actions.device)
+        actions = torch.where(which, sides[self.actions], self.actions)
+        return Batch(images, actions, self.rewards)
 
 
 class Batches(Protocol):

@@ -8,11 +8,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from shared.rl import trunk
-from shared.rl.batches import Batches, Ranks, ResidentBatches, StoredBatches
+from shared.rl.batches import Batches, Mask, Ranks, ResidentBatches, StoredBatches
 from shared.rl.draws import generator
 from shared.rl.engine import arithmetic, scaled
 from shared.rl.equalisation import due
@@ -91,14 +92,14 @@ class Trainer:
         self.version += 1
         return True
 
-    def step(self, samples: SampleStore, ranks: Ranks) -> float:
+    def step(self, samples: SampleStore, ranks: Ranks, mirrored: Mask | None = None) -> float:
         """One RMSprop step on the mean squared error of the unclipped output (Eq 3.4, E8).
 
-        Returns the loss; raises FloatingPointError when it is not finite, leaving the weights as
-        they were.
+        mirrored: bool [k], which samples to look at in a mirror. Returns the loss; raises
+        FloatingPointError when it is not finite, leaving the weights as they were.
         """
         batches = StoredBatches(samples, self._numerics.device)
-        loss = self._checked(float(self._set_gradients(batches, ranks)))
+        loss = self._checked(float(self._set_gradients(batches, ranks, mirrored)))
         self._apply_gradients()
         return loss
 
@@ -140,7 +141,7 @@ class Trainer:
         for batch in range(self._learning.mini_batches_per_episode):
             draw = generator(self._seed, "mini-batch", episode, batch)
             ranks = draw.choice(len(samples), size=size, replace=False)
-            yield Trained(self.step(samples, ranks), 0, batch + 1, 0)
+            yield Trained(self.step(samples, ranks, self._mirrored(draw, size)), 0, batch + 1, 0)
 
     def _fit(self, samples: SampleStore, episode: int) -> Iterator[Trained]:
         """A36: epochs of shuffled mini-batches, the last, partial one included (E30)."""
@@ -153,8 +154,8 @@ class Trainer:
 
     def _steps(self, samples: SampleStore, episode: int) -> Iterator[tuple[int, float | None]]:
         """The steps of a fitting phase: the epoch each belongs to, and its loss."""
-        for epoch, ranks in self._shuffled(len(samples), episode):
-            yield epoch, self.step(samples, ranks)
+        for epoch, ranks, mirrored in self._shuffled(len(samples), episode):
+            yield epoch, self.step(samples, ranks, mirrored)
 
     def _deferred_steps(
         self, samples: SampleStore, episode: int
@@ -166,19 +167,25 @@ class Trainer:
         """
         batches, losses = ResidentBatches(samples, self._numerics.device), []
         last = self.fit_batches(len(samples))
-        for epoch, ranks in self._shuffled(len(samples), episode):
-            losses.append(self._set_gradients(batches, ranks))
+        for epoch, ranks, mirrored in self._shuffled(len(samples), episode):
+            losses.append(self._set_gradients(batches, ranks, mirrored))
             self._apply_gradients()
             ended = len(losses) == last
             yield epoch, self._checked(float(torch.stack(losses).mean())) if ended else None
 
-    def _shuffled(self, count: int, episode: int) -> Iterator[tuple[int, Ranks]]:
+    def _shuffled(self, count: int, episode: int) -> Iterator[tuple[int, Ranks, Mask | None]]:
         for epoch in range(self._learning.fit_epochs):
-            order = generator(self._seed, "fit", episode, epoch).permutation(count)
+            draw = generator(self._seed, "fit", episode, epoch)
+            order = draw.permutation(count)
             for start in range(0, count, self._learning.batch_size):
-                yield epoch, order[start : start + self._learning.batch_size]
+                ranks = order[start : start + self._learning.batch_size]
+                yield epoch, ranks, self._mirrored(draw, len(ranks))
 
-    def _set_gradients(self, batches: Batches, ranks: Ranks) -> Tensor:
+    def _mirrored(self, draw: np.random.Generator, count: int) -> Mask | None:
+        """Which samples of a mini-batch to look at in a mirror: by chance, half of them."""
+        return draw.random(count) < 0.5 if self._learning.augmentation == "mirror" else None
+
+    def _set_gradients(self, batches: Batches, ranks: Ranks, mirrored: Mask | None) -> Tensor:
         """Put the gradient of a mini-batch where the optimiser looks; returns the loss.
 
         Each thread takes one share of the mini-batch, and the shares are added up in order: the
@@ -186,9 +193,14 @@ class Trainer:
         other after every operation would be slower, and hopeless beside another busy process.
         """
         size = -(-len(ranks) // self._numerics.threads)
-        shares = [ranks[start : start + size] for start in range(0, len(ranks), size)]
-        work = [self._pool.submit(self._share, batches, share, len(ranks)) for share in shares[1:]]
-        loss, *gradients = self._share(batches, shares[0], len(ranks))
+        shares = [slice(start, start + size) for start in range(0, len(ranks), size)]
+
+        def share(part: slice) -> tuple[Tensor, ...]:
+            some = None if mirrored is None else mirrored[part]
+            return self._share(batches, ranks[part], some, len(ranks))
+
+        work = [self._pool.submit(share, part) for part in shares[1:]]
+        loss, *gradients = share(shares[0])
         others = [each.result() for each in work]
         for more, *further in others:
             loss = loss + more
@@ -198,12 +210,16 @@ class Trainer:
             parameter.grad = gradient
         return loss
 
-    def _share(self, batches: Batches, ranks: Ranks, count: int) -> tuple[Tensor, ...]:
+    def _share(
+        self, batches: Batches, ranks: Ranks, mirrored: Mask | None, count: int
+    ) -> tuple[Tensor, ...]:
         """Loss and gradients of one share of a mini-batch of `count`."""
         network, part = self.train_network, self._numerics.images_per_pass
         reduced = self._numerics.precision == "bfloat16"
         with arithmetic(self._in_a_share):
             batch = batches.take(ranks)
+            if mirrored is not None:
+                batch = batch.mirrored(torch.from_numpy(mirrored).to(batch.actions.device))
             parts = [scaled(some) for some in batch.images.split(part)]  # type: ignore[no-untyped-call]
             maps = [trunk.maps(network, p) if reduced else network.maps(p) for p in parts]
             error = batch.rewards - network.values(torch.cat(maps), batch.actions)
