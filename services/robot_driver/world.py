@@ -2,13 +2,14 @@
 
 A world is a set of closed wall loops with free space on their left: first the boundary, which runs
 anticlockwise, then islands, which run clockwise. Every wall segment has a texture; fixtures (doors,
-windows, notice boards, radiators) are painted onto segments. Units are metres and degrees, x to the
-right and y up on the map.
+windows, notice boards, radiators) are painted onto segments. Obstacles are boxes that stand in it.
+Units are metres and degrees, x to the right and y up on the map.
 """
 
 from __future__ import annotations
 
 import hashlib
+import math
 import tomllib
 from functools import cached_property
 from pathlib import Path
@@ -16,10 +17,20 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 WORLDS = Path(__file__).parent / "worlds"
 """Folder of the worlds that come with the driver."""
+MAX_OBSTACLES = 64
+"""More boxes than this do not stand in a world at the same time."""
 
 Floats = npt.NDArray[np.float64]
 Text = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,40}$")]
@@ -116,6 +127,44 @@ class Fixture(_Part):
     rgb: Colour
 
 
+class Obstacle(_Part):
+    """A box standing on the floor: solid, and seen from its sides and from above."""
+
+    name: Text
+    x_m: Coordinate
+    """Of its middle."""
+    y_m: Coordinate
+    heading_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
+    """Direction along which `length_m` is measured."""
+    length_m: Length
+    width_m: Length
+    height_m: Length
+    rgb: Colour
+
+    @property
+    def corners(self) -> Floats:
+        """float64 [4, 2], anticlockwise."""
+        turn = math.radians(self.heading_deg)
+        c, s = math.cos(turn), math.sin(turn)
+        signs = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+        local = signs * (self.length_m / 2, self.width_m / 2)
+        return np.asarray(local @ np.array([[c, s], [-s, c]]) + (self.x_m, self.y_m))
+
+    @property
+    def segments(self) -> Floats:
+        """float64 [4, 4] of its sides: start x, y, end x, y; free space on the left."""
+        clockwise = self.corners[::-1]
+        return np.hstack([clockwise, np.roll(clockwise, -1, axis=0)])
+
+    def contains(self, points: Floats) -> npt.NDArray[np.bool_]:
+        """Whether points float64 [n, 2] lie inside it."""
+        turn = math.radians(self.heading_deg)
+        x, y = points[:, 0] - self.x_m, points[:, 1] - self.y_m
+        along = np.abs(x * math.cos(turn) + y * math.sin(turn))
+        across = np.abs(y * math.cos(turn) - x * math.sin(turn))
+        return np.asarray((along < self.length_m / 2) & (across < self.width_m / 2))
+
+
 class Start(_Part):
     """A pose from which a robot may start."""
 
@@ -144,15 +193,19 @@ class World(_Part):
     fixtures: Annotated[tuple[Fixture, ...], Field(strict=False)] = ()
     starts: Annotated[tuple[Start, ...], Field(min_length=1, strict=False)]
     lap: Lap | None = None
+    obstacles: Annotated[tuple[Obstacle, ...], Field(max_length=MAX_OBSTACLES, strict=False)] = ()
+    """Boxes that stand there from the beginning."""
 
-    @field_validator("walls")
+    @field_validator("walls", "obstacles")
     @classmethod
-    def _walls_named_once(cls, walls: tuple[Wall, ...]) -> tuple[Wall, ...]:
-        names = [wall.name for wall in walls]
+    def _named_once(
+        cls, parts: tuple[Wall | Obstacle, ...], info: ValidationInfo
+    ) -> tuple[Wall | Obstacle, ...]:
+        names = [part.name for part in parts]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise ValueError(f"two walls are named {twice[0]!r}")
-        return walls
+            raise ValueError(f"two {info.field_name} are named {twice[0]!r}")
+        return parts
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -160,10 +213,15 @@ class World(_Part):
         self._check_textures()
         for i, fixture in enumerate(self.fixtures):
             self._check_fixture(f"fixtures.{i}", fixture)
+        for i, obstacle in enumerate(self.obstacles):
+            try:
+                self.check_obstacle(obstacle)
+            except ValueError as error:
+                raise ValueError(f"obstacles.{i}: {error}") from None
         for i, start in enumerate(self.starts):
             if not self.free(np.array([[start.x_m, start.y_m]]))[0]:
                 raise ValueError(f"starts.{i}: ({start.x_m}, {start.y_m}) is not in free space")
-        if self.lap is not None and self.free(np.array([self.lap.centre]))[0]:
+        if self.lap is not None and self.between_walls(np.array([self.lap.centre]))[0]:
             raise ValueError("lap.centre: a robot could drive over it; put it on an island")
         return self
 
@@ -198,10 +256,35 @@ class World(_Part):
         if fixture.bottom_m + fixture.height_m > self.height_m:
             raise ValueError(f"{key}.height_m: higher than the wall ({self.height_m} m)")
 
+    def check_obstacle(self, obstacle: Obstacle) -> None:
+        """Whether a box can stand in this world; it may touch or reach into walls.
+
+        Raises:
+            ValueError: It reaches beyond the outermost walls or through the ceiling.
+        """
+        x0, y0, x1, y1 = self.bounds
+        slack = 1e-6  # of a box turned against a wall
+        low, high = obstacle.corners.min(axis=0), obstacle.corners.max(axis=0)
+        if bool(np.any(low < (x0 - slack, y0 - slack)) or np.any(high > (x1 + slack, y1 + slack))):
+            raise ValueError(
+                f"obstacle {obstacle.name!r}: expected x {x0:g}..{x1:g}, y {y0:g}..{y1:g}, "
+                f"got x {low[0]:g}..{high[0]:g}, y {low[1]:g}..{high[1]:g}"
+            )
+        if obstacle.height_m > self.height_m:
+            raise ValueError(
+                f"obstacle {obstacle.name!r}: height_m {obstacle.height_m:g} is higher than "
+                f"the walls ({self.height_m:g} m)"
+            )
+
     @property
     def segments(self) -> Floats:
         """float64 [n, 4] of all walls: start x, y, end x, y; free space on the left."""
         return np.vstack([wall.segments for wall in self.walls])
+
+    @property
+    def solid_segments(self) -> Floats:
+        """float64 [n, 4] of all walls and obstacles, as `segments`."""
+        return np.vstack([self.segments, *(obstacle.segments for obstacle in self.obstacles)])
 
     @cached_property
     def fingerprint(self) -> str:
@@ -215,8 +298,8 @@ class World(_Part):
         low, high = xy.min(axis=0), xy.max(axis=0)
         return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
-    def free(self, points: Floats) -> npt.NDArray[np.bool_]:
-        """Whether points float64 [n, 2] lie between the walls: inside the boundary, off islands."""
+    def between_walls(self, points: Floats) -> npt.NDArray[np.bool_]:
+        """Whether points float64 [n, 2] lie inside the boundary and off islands."""
         x, y = points[:, 0, None], points[:, 1, None]
         ax, ay, bx, by = self.segments.T[:, None, :]
         spans = (ay > y) != (by > y)
@@ -224,9 +307,16 @@ class World(_Part):
         crosses = spans & (x < ax + (y - ay) / rise * (bx - ax))
         return np.asarray(np.count_nonzero(crosses, axis=1) % 2 == 1)
 
+    def free(self, points: Floats) -> npt.NDArray[np.bool_]:
+        """Whether points float64 [n, 2] lie between the walls and in no obstacle."""
+        free = self.between_walls(points)
+        for obstacle in self.obstacles:
+            free &= ~obstacle.contains(points)
+        return free
+
     def distance(self, points: Floats) -> Floats:
-        """Distance of points float64 [n, 2] to the nearest wall, float64 [n], metres."""
-        start, end = self.segments[:, :2], self.segments[:, 2:]
+        """Distance of points float64 [n, 2] to the nearest wall or obstacle, float64 [n]."""
+        start, end = np.hsplit(self.solid_segments, 2)
         along = end - start
         length2 = np.einsum("ij,ij->i", along, along)
         offset = points[:, None, :] - start
@@ -235,13 +325,14 @@ class World(_Part):
         return np.asarray(np.sqrt(np.einsum("nsj,nsj->ns", gap, gap).min(axis=1)))
 
     def clearance(self, points: Floats) -> Floats:
-        """Distance to the nearest wall, negative off free space; float64 [n, 2] to float64 [n]."""
+        """As `distance`, but negative off free space."""
         distance = self.distance(points)
         return np.where(self.free(points), distance, -distance)
 
     def sight(self, points: Floats, headings_rad: Floats) -> Floats:
         """How far one sees from points float64 [n, 2] in given directions [n]; inf if for ever."""
-        start, along = self.segments[:, :2], self.segments[:, 2:] - self.segments[:, :2]
+        start, end = np.hsplit(self.solid_segments, 2)
+        along = end - start
         look = np.column_stack([np.cos(headings_rad), np.sin(headings_rad)])[:, None, :]
         offset = start - points[:, None, :]
         cross = look[..., 0] * along[:, 1] - look[..., 1] * along[:, 0]

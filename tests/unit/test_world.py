@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.robot_driver.world import WORLDS, World, WorldError, load_world, read_world
+from services.robot_driver.world import WORLDS, Obstacle, World, WorldError, load_world, read_world
 
 PLUS = (WORLDS / "plus.toml").read_text(encoding="utf-8")
 
@@ -141,3 +141,103 @@ def test_sight_ends_at_the_first_wall(x: float, y: float, heading: float):
     assert np.all(world.clearance(way) > -1e-9)
     behind = [[x + (far + 0.001) * math.cos(heading), y + (far + 0.001) * math.sin(heading)]]
     assert world.distance(np.array(behind))[0] <= 0.001 + 1e-9
+
+
+BOX = """
+[[obstacles]]
+name = "box"
+x_m = 0.0
+y_m = 3.8
+heading_deg = 30.0
+length_m = 0.8
+width_m = 0.4
+height_m = 0.6
+rgb = [200, 30, 30]
+"""
+
+
+def with_boxes(folder: Path, *boxes: str) -> World:
+    path = folder / "plus.toml"
+    path.write_text(PLUS + "".join(boxes), encoding="utf-8")
+    return read_world(path)
+
+
+@given(x=st.floats(-0.8, 0.8), y=st.floats(3.2, 4.4), heading=st.floats(-math.pi, math.pi))
+@settings(max_examples=200, deadline=None)
+def test_an_obstacle_is_off_free_space_and_ends_sight(x: float, y: float, heading: float):
+    bare = load_world("plus")
+    obstacle = Obstacle(
+        name="box",
+        x_m=0.0,
+        y_m=3.8,
+        heading_deg=30.0,
+        length_m=0.8,
+        width_m=0.4,
+        height_m=0.6,
+        rgb=(1, 2, 3),
+    )
+    world = World.model_validate({**bare.model_dump(), "obstacles": [obstacle.model_dump()]})
+    c, s = math.cos(math.pi / 6), math.sin(math.pi / 6)
+
+    def gap(px: float, py: float) -> float:
+        """Signed distance to the box, by its own axes."""
+        along = abs(px * c + (py - 3.8) * s) - 0.4
+        across = abs((py - 3.8) * c - px * s) - 0.2
+        return math.hypot(max(along, 0), max(across, 0)) + min(max(along, across), 0)
+
+    if abs(gap(x, y)) < 1e-6:
+        return
+    point = np.array([[x, y]])
+    assert world.free(point)[0] == (gap(x, y) > 0)
+    expected = min(gap(x, y), float(bare.clearance(point)[0]))
+    assert world.clearance(point)[0] == pytest.approx(expected)
+    if gap(x, y) > 0:
+        far = float(world.sight(point, np.array([heading]))[0])
+        way = [(x + far * t * math.cos(heading), y + far * t * math.sin(heading)) for t in (0.5, 1)]
+        assert min(gap(*place) for place in way) > -1e-9
+        end = np.array([way[1]])
+        assert min(gap(*way[1]), bare.distance(end)[0]) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_obstacles_are_read_from_the_file_and_change_its_fingerprint(tmp_path: Path):
+    world = with_boxes(tmp_path, BOX)
+    assert [obstacle.name for obstacle in world.obstacles] == ["box"]
+    assert world.fingerprint != load_world("plus").fingerprint
+    assert len(world.solid_segments) == len(world.segments) + 4
+    assert load_world("plus").solid_segments.shape == world.segments.shape
+
+
+def test_a_box_may_reach_into_a_wall_and_what_lies_in_both_is_not_free(tmp_path: Path):
+    world = with_boxes(tmp_path, BOX.replace("y_m = 3.8", "y_m = 2.8"))
+    assert not world.free(np.array([[0.0, 2.65], [0.0, 2.8]])).any()
+    assert world.between_walls(np.array([[0.0, 2.8]]))[0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("x_m = 0.0", "x_m = 4.8", "obstacles.0: obstacle 'box': expected x -4.9..4.9"),
+        ("x_m = 0.0", "x_m = inf", "obstacles.0.x_m: "),
+        ("height_m = 0.6", "height_m = 2.7", "obstacles.0: obstacle 'box': height_m 2.7 is higher"),
+        ("height_m = 0.6", "height_m = 0.0", "obstacles.0.height_m: "),
+        ("length_m = 0.8", "", "obstacles.0.length_m: Field required"),
+        ('"box"', '"A Box"', "obstacles.0.name: "),
+        (
+            "x_m = 0.0\ny_m = 3.8",
+            "x_m = 3.8\ny_m = 0.0",
+            "starts.0: (3.8, 0.0) is not in free space",
+        ),
+    ],
+)
+def test_boxes_that_cannot_stand_there_are_refused(
+    tmp_path: Path, old: str, new: str, message: str
+):
+    assert old in BOX
+    with pytest.raises(WorldError) as refused:
+        with_boxes(tmp_path, BOX.replace(old, new, 1))
+    assert message in str(refused.value)
+
+
+def test_two_boxes_of_one_name_are_refused(tmp_path: Path):
+    with pytest.raises(WorldError, match="obstacles: two obstacles are named 'box'"):
+        with_boxes(tmp_path, BOX, BOX)
