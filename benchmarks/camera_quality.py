@@ -26,7 +26,8 @@ from typing import Any
 
 from benchmarks import driving
 from benchmarks.driving import Figures
-from benchmarks.frame import Bar, commit, report, table
+from benchmarks.frame import Bar, report, table
+from experiments.provenance import commit
 from experiments.single_process import SingleProcess
 from services.robot_driver.sim import SimRobot
 from services.robot_driver.world import load_world

@@ -8,20 +8,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import platform
-import shutil
-import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from statistics import median
 from typing import Any, Literal
 
-import torch
+from experiments.provenance import machine
 
-ROOT = Path(__file__).parents[1]
 Mode = Literal["check", "short", "full"]
 Better = Literal["higher", "lower"]
 Times = dict[str, list[float]]
@@ -149,43 +143,6 @@ def as_json(bar: Bar) -> dict[str, Any]:
 def from_json(tree: dict[str, Any]) -> Bar:
     """A bar of a last line. Raises TypeError when fields are missing or unknown."""
     return Bar(**tree)
-
-
-def machine() -> dict[str, str]:
-    """What the figures were measured on."""
-    return {
-        "cpu": _processor(),
-        "cores": str(len(os.sched_getaffinity(0))),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "commit": commit(),
-    }
-
-
-def commit() -> str:
-    """The commit measured, with a plus when tracked files differ from it."""
-    git = shutil.which("git")
-    if git is None or not (ROOT / ".git").exists():
-        return "unknown"
-
-    def said(*words: str) -> str:
-        done = subprocess.run([git, *words], cwd=ROOT, capture_output=True, text=True, check=False)
-        return done.stdout.strip()
-
-    changed = said("status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs", *RESULTS)
-    return said("rev-parse", "--short", "HEAD") + ("+" if changed else "")
-
-
-RESULTS = (":!benchmarks/results.json", ":!benchmarks/results.md")
-"""Written by measuring: no change to what is measured."""
-
-
-def _processor() -> str:
-    info = Path("/proc/cpuinfo")
-    for line in info.read_text().splitlines() if info.exists() else ():
-        if line.startswith("model name"):
-            return line.split(":")[1].strip()
-    return platform.processor() or platform.machine()
 
 
 def _cell(value: object) -> str:

@@ -19,7 +19,8 @@ from statistics import median
 
 import numpy as np
 
-from benchmarks.frame import ROOT, Bar, Mode, mode_of, report, table
+from benchmarks.frame import Bar, Mode, mode_of, report, table
+from experiments.provenance import ROOT
 from shared.config import MemoryConfig
 from shared.rl.memory import SAMPLE, ReplayMemory
 from shared.rl.retention import discard, recompute_marks

@@ -20,8 +20,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from benchmarks.frame import ROOT, Bar, bar_row, from_json, machine, table
+from benchmarks.frame import Bar, bar_row, from_json, table
 from benchmarks.peers import NOT_INSTALLED
+from experiments.provenance import ROOT, machine
 
 HERE = Path(__file__).parent
 RESULTS, PAGE = HERE / "results.json", ROOT / "docs" / "performance.md"

@@ -25,8 +25,9 @@ from benchmarks.distribution import (
     connected,
     more_robots,
 )
-from benchmarks.frame import Mode, machine, mode_of, table
+from benchmarks.frame import Mode, mode_of, table
 from benchmarks.run_all import PAGE, renewed
+from experiments.provenance import machine
 from experiments.single_process import SingleProcess
 from services.monitor.supervisor import Supervisor
 from services.monitor.up import child_specs, free_endpoint

@@ -16,7 +16,6 @@ import torch
 
 from benchmarks import frames, plain
 from benchmarks.frame import (
-    ROOT,
     Mode,
     Times,
     interleaved,
@@ -27,6 +26,7 @@ from benchmarks.frame import (
     times_table,
 )
 from benchmarks.frame import table as as_table
+from experiments.provenance import ROOT
 from shared.config import Config, LearnerNumerics, LearningConfig, Numerics
 from shared.numerics import choose
 from shared.rl.learning import Trainer

@@ -10,6 +10,7 @@ import pytest
 
 from benchmarks import frame, frames, run_all
 from benchmarks.frame import Bar
+from experiments import provenance
 
 FIELDS = {
     "id", "value", "unit", "better", "required", "aim", "baseline_median", "ours_median", "n",
@@ -87,7 +88,7 @@ def test_a_speedup_is_the_ratio_of_medians() -> None:
 def test_results_become_tables_between_the_marks_of_a_page() -> None:
     entry = {
         "command": "python -m benchmarks.training_step", "mode": "full", "when": "now",
-        "seconds": 1.0, "error": "", "machine": frame.machine(),
+        "seconds": 1.0, "error": "", "machine": provenance.machine(),
         "bars": [frame.as_json(make_bar(checks={"cosine": 0.9999}))],
     }  # fmt: skip
     failed = {**entry, "bars": [], "error": "exit code 1"}

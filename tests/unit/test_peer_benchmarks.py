@@ -17,7 +17,7 @@ from gymnasium.utils.env_checker import check_env
 
 from benchmarks import peer_learning, peer_transport, peers, run_all
 from benchmarks.corridor_env import CorridorEnv
-from benchmarks.frame import ROOT
+from experiments.provenance import ROOT
 from shared.config import Config
 
 SCRIPTS = ("peer_learning", "peer_replay", "peer_transport")
