@@ -7,6 +7,7 @@ Light is painted in: walls are brighter or darker by direction, and darker towar
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 
@@ -24,8 +25,8 @@ TEXELS_PER_M = 32
 _OVERSAMPLING = 4
 _DRAW = TEXELS_PER_M * _OVERSAMPLING
 """Pixels per metre while drawing."""
-_FLAT_M = {"tiles": 1.2, "panels": 1.2}
-"""Size of the repeated square of floor and ceiling materials."""
+_TILE_M = 1.2
+"""Size of the square that floors and ceilings repeat."""
 
 
 def wall_picture(world: World, wall: Wall, segment: int) -> Picture:
@@ -47,10 +48,9 @@ def wall_picture(world: World, wall: Wall, segment: int) -> Picture:
 
 def flat_tile(texture: Texture) -> tuple[Picture, float]:
     """The square that floor or ceiling repeats, and its size in metres."""
-    size = _FLAT_M.get(texture.kind, 1.2)
-    canvas = _blank(size, size, texture.rgb)
+    canvas = _blank(_TILE_M, _TILE_M, texture.rgb)
     _MATERIALS[texture.kind](canvas, texture)
-    return _finish(canvas), size
+    return _finish(canvas), _TILE_M
 
 
 def _blank(width_m: float, height_m: float, rgb: Colour) -> Canvas:
@@ -157,6 +157,61 @@ def _panels(canvas: Canvas, texture: Texture) -> None:
     _box(canvas, joint * 2, joint * 2, size - joint * 3, size - joint * 3, (255, 255, 246))
 
 
+def _stripes(canvas: Canvas, texture: Texture) -> None:
+    """Wallpaper of broad and narrow vertical stripes between skirting board and picture rail."""
+    w, h = canvas.shape[1] / _DRAW, canvas.shape[0] / _DRAW
+    step = 0.5
+    for column in range(math.ceil(w / step)):
+        _box(canvas, column * step, 0.0, 0.2, h, texture.accent)
+        _box(canvas, column * step + 0.28, 0.0, 0.05, h, _mix(texture.accent, 0.7))
+    _box(canvas, 0.0, 0.0, w, 0.22, (240, 238, 230))
+    _box(canvas, 0.0, h - 0.3, w, 0.07, (240, 238, 230))
+
+
+def _mosaic(canvas: Canvas, texture: Texture) -> None:
+    """Chequered wall tiles up to 1.5 m, a border of the accent colour, plain wall above."""
+    w = canvas.shape[1] / _DRAW
+    size, rows = 0.25, 6
+    canvas[:] = _mix(texture.rgb, 1.2)
+    for row in range(rows):
+        for column in range(math.ceil(w / size)):
+            rgb = texture.rgb if (row + column) % 2 else texture.accent
+            rgb = _mix(rgb, 1.0 + 0.06 * _variation(row, column))
+            _box(canvas, column * size, row * size, size, size, rgb)
+    _box(canvas, 0.0, rows * size, w, 0.1, _mix(texture.accent, 0.6))
+
+
+def _concrete(canvas: Canvas, texture: Texture) -> None:
+    """Cast slabs, two high, with joints and the round marks of the formwork."""
+    w, h = canvas.shape[1] / _DRAW, canvas.shape[0] / _DRAW
+    long, tall, joint = 1.25, h / 2, 0.05
+    for row in range(2):
+        for column in range(math.ceil(w / long)):
+            x, y = column * long, row * tall
+            rgb = _mix(texture.rgb, 1.0 + 0.1 * _variation(row + 5, column))
+            _box(canvas, x, y, long, tall, texture.accent)
+            _box(canvas, x + joint, y + joint, long - joint, tall - joint, rgb)
+            for u, v in itertools.product((0.25, 0.75), repeat=2):
+                _box(canvas, x + u * long, y + v * tall, 0.09, 0.09, texture.accent)
+
+
+def _planks(canvas: Canvas, texture: Texture) -> None:
+    """Floor boards with dark joints, laid in four courses that are shifted against each other."""
+    size = canvas.shape[0] / _DRAW
+    wide = size / 4
+    for row in range(4):
+        _box(canvas, 0.0, row * wide, size, wide, _mix(texture.rgb, 1.0 + 0.08 * (row % 3 - 1)))
+        _box(canvas, 0.0, row * wide, size, 0.03, texture.accent)
+        _box(canvas, size * (row * 2 % 4) / 4, row * wide, 0.03, wide, texture.accent)
+
+
+def _strip_light(canvas: Canvas, texture: Texture) -> None:
+    """Plain ceiling with one long lamp in a dark trough."""
+    size = canvas.shape[0] / _DRAW
+    _box(canvas, 0.15, size * 0.4, size - 0.3, 0.24, texture.accent)
+    _box(canvas, 0.2, size * 0.4 + 0.06, size - 0.4, 0.12, (255, 255, 250))
+
+
 def _door(canvas: Canvas, fixture: Fixture, length: float, height: float) -> None:
     """Frame, leaf with two fields, handle."""
     del height
@@ -218,6 +273,11 @@ _MATERIALS: dict[str, Callable[[Canvas, Texture], None]] = {
     "panelling": _panelling,
     "tiles": _tiles,
     "panels": _panels,
+    "stripes": _stripes,
+    "mosaic": _mosaic,
+    "concrete": _concrete,
+    "planks": _planks,
+    "strip-light": _strip_light,
 }
 _FIXTURES: dict[str, Callable[[Canvas, Fixture, float, float], None]] = {
     "door": _door,

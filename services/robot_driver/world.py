@@ -31,6 +31,8 @@ WORLDS = Path(__file__).parent / "worlds"
 """Folder of the worlds that come with the driver."""
 MAX_OBSTACLES = 64
 """More boxes than this do not stand in a world at the same time."""
+_POINTS_AT_ONCE = 8192
+"""Points against all walls at a time: bounds the memory of looking at a whole grid."""
 
 Floats = npt.NDArray[np.float64]
 Text = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,40}$")]
@@ -40,7 +42,12 @@ Point = Annotated[tuple[Coordinate, Coordinate], Field(strict=False)]
 Channel = Annotated[int, Field(ge=0, le=255)]
 Colour = Annotated[tuple[Channel, Channel, Channel], Field(strict=False)]
 """Red, green, blue."""
-Material = Literal["plaster", "brick", "panelling", "tiles", "panels"]
+Material = Literal[
+    "plaster", "brick", "panelling", "stripes", "mosaic", "concrete",
+    "tiles", "planks", "panels", "strip-light",
+]  # fmt: skip
+"""Six for walls, two for floors, two for ceilings; any may be used anywhere."""
+PlaceKind = Literal["dead-end", "bridge", "junction", "window", "door", "obstacle", "corridor"]
 FixtureKind = Literal["door", "window", "board", "radiator"]
 
 
@@ -180,6 +187,38 @@ class Lap(_Part):
     line: Annotated[tuple[Point, Point], Field(strict=False)]
 
 
+class Place(_Part):
+    """A named place on a route."""
+
+    name: Text
+    kind: PlaceKind
+    x_m: Coordinate
+    y_m: Coordinate
+
+
+class Route(_Part):
+    """A full tour of the world, for test drives: how much of it was driven, past which places."""
+
+    points: Annotated[tuple[Point, ...], Field(min_length=2, max_length=256, strict=False)]
+    """A line from the first point to the last."""
+    places: Annotated[tuple[Place, ...], Field(max_length=64, strict=False)] = ()
+
+    @property
+    def length_m(self) -> float:
+        """Of the line."""
+        steps = np.diff(np.array(self.points, np.float64), axis=0)
+        return float(np.hypot(steps[:, 0], steps[:, 1]).sum())
+
+    def sample(self, spacing_m: float) -> Floats:
+        """Points along the line, ends included, at most so far apart; float64 [n, 2]."""
+        points = np.array(self.points, np.float64)
+        lengths = np.hypot(*np.diff(points, axis=0).T)
+        at = np.concatenate([[0.0], np.cumsum(lengths)])
+        fine = np.linspace(0.0, at[-1], math.ceil(at[-1] / spacing_m) + 1)
+        s = np.union1d(fine, at)
+        return np.column_stack([np.interp(s, at, points[:, k]) for k in range(2)])
+
+
 class World(_Part):
     """One corridor (A3)."""
 
@@ -193,6 +232,7 @@ class World(_Part):
     fixtures: Annotated[tuple[Fixture, ...], Field(strict=False)] = ()
     starts: Annotated[tuple[Start, ...], Field(min_length=1, strict=False)]
     lap: Lap | None = None
+    route: Route | None = None
     obstacles: Annotated[tuple[Obstacle, ...], Field(max_length=MAX_OBSTACLES, strict=False)] = ()
     """Boxes that stand there from the beginning."""
 
@@ -223,6 +263,8 @@ class World(_Part):
                 raise ValueError(f"starts.{i}: ({start.x_m}, {start.y_m}) is not in free space")
         if self.lap is not None and self.between_walls(np.array([self.lap.centre]))[0]:
             raise ValueError("lap.centre: a robot could drive over it; put it on an island")
+        if self.route is not None:
+            self._check_route(self.route)
         return self
 
     def _check_loops(self) -> None:
@@ -255,6 +297,21 @@ class World(_Part):
             raise ValueError(f"{key}.at_m: does not fit onto a segment of {room:.2f} m")
         if fixture.bottom_m + fixture.height_m > self.height_m:
             raise ValueError(f"{key}.height_m: higher than the wall ({self.height_m} m)")
+
+    def _check_route(self, route: Route) -> None:
+        """On free space all the way; it may cross itself, and obstacles may be driven round."""
+        places = {"route.points": route.sample(0.05)}
+        for i, place in enumerate(route.places):
+            places[f"route.places.{i}"] = np.array([[place.x_m, place.y_m]])
+        for key, points in places.items():
+            outside = points[~self.between_walls(points)]
+            if len(outside):
+                x, y = outside[0]
+                raise ValueError(f"{key}: ({x:g}, {y:g}) is not in free space")
+        names = [place.name for place in route.places]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"route.places: two are named {twice[0]!r}")
 
     def check_obstacle(self, obstacle: Obstacle) -> None:
         """Whether a box can stand in this world; it may touch or reach into walls.
@@ -316,6 +373,10 @@ class World(_Part):
 
     def distance(self, points: Floats) -> Floats:
         """Distance of points float64 [n, 2] to the nearest wall or obstacle, float64 [n]."""
+        parts = range(0, max(len(points), 1), _POINTS_AT_ONCE)
+        return np.concatenate([self._distance(points[i : i + _POINTS_AT_ONCE]) for i in parts])
+
+    def _distance(self, points: Floats) -> Floats:
         start, end = np.hsplit(self.solid_segments, 2)
         along = end - start
         length2 = np.einsum("ij,ij->i", along, along)

@@ -2,12 +2,13 @@
 
 import hashlib
 import itertools
+from typing import get_args
 
 import numpy as np
 import pytest
 
 from services.robot_driver.textures import TEXELS_PER_M, flat_tile, wall_picture
-from services.robot_driver.world import Texture, World, load_world
+from services.robot_driver.world import Material, Texture, World, load_world
 
 WORLD = load_world("plus")
 PLACES = [(wall, i) for wall in WORLD.walls for i in range(len(wall.points))]
@@ -29,7 +30,7 @@ def test_a_picture_is_as_large_as_its_wall(wall, segment: int):
     assert picture.shape[1] == pytest.approx(wall.lengths[segment] * TEXELS_PER_M, abs=1)
 
 
-@pytest.mark.parametrize("kind", ["plaster", "brick", "panelling", "tiles", "panels"])
+@pytest.mark.parametrize("kind", get_args(Material))
 def test_materials_have_structure_but_no_noise(kind: str):
     tile, size_m = flat_tile(Texture(kind=kind, rgb=(160, 140, 120), accent=(90, 80, 70)))
     grey = tile.astype(float).mean(axis=2)

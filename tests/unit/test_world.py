@@ -241,3 +241,56 @@ def test_boxes_that_cannot_stand_there_are_refused(
 def test_two_boxes_of_one_name_are_refused(tmp_path: Path):
     with pytest.raises(WorldError, match="obstacles: two obstacles are named 'box'"):
         with_boxes(tmp_path, BOX, BOX)
+
+
+ROUTE = """
+[route]
+points = [[3.8, 0.0], [3.8, 2.5], [3.3, 2.9]]
+
+[[route.places]]
+name = "east"
+kind = "corridor"
+x_m = 3.8
+y_m = 0.0
+"""
+
+
+def with_route(folder: Path, route: str) -> World:
+    path = folder / "plus.toml"
+    path.write_text(PLUS + route, encoding="utf-8")
+    return read_world(path)
+
+
+def test_a_route_is_sampled_evenly_and_through_its_corners(tmp_path: Path):
+    route = with_route(tmp_path, ROUTE).route
+    assert route is not None
+    assert route.length_m == pytest.approx(2.5 + math.hypot(0.5, 0.4))
+    points = route.sample(0.1)
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    assert steps.max() <= 0.1 + 1e-9
+    assert steps.sum() == pytest.approx(route.length_m)
+    for corner in route.points:
+        assert np.hypot(*(points - corner).T).min() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[3.3, 2.9]", "[3.3, 6.0]", "route.points: ("),
+        ("[3.8, 2.5]", "[0.0, 2.0]", "route.points: ("),  # through the island
+        ("points = [[3.8, 0.0], [3.8, 2.5], [3.3, 2.9]]", "points = [[3.8, 0.0]]", "route.points"),
+        ("x_m = 3.8", "x_m = 0.0", "route.places.0: (0, 0) is not in free space"),
+        ('"corridor"', '"lift"', "route.places.0.kind: Input should be 'dead-end'"),
+    ],
+)
+def test_routes_through_walls_are_refused(tmp_path: Path, old: str, new: str, message: str):
+    assert old in ROUTE
+    with pytest.raises(WorldError) as refused:
+        with_route(tmp_path, ROUTE.replace(old, new, 1))
+    assert message in str(refused.value)
+
+
+def test_two_places_of_one_name_are_refused(tmp_path: Path):
+    place = ROUTE[ROUTE.index("[[route.places]]") :]
+    with pytest.raises(WorldError, match=r"route.places: two are named 'east'"):
+        with_route(tmp_path, ROUTE + place)
