@@ -1,16 +1,18 @@
 """The one builder from a world to PyBullet, and the only file that imports it.
 
-PyBullet answers two questions: how far is a body at this place from the nearest wall, and what
-does the camera see from this pose. It never steps time, so nothing it remembers from earlier
-questions can influence an answer (A2).
+PyBullet answers two questions: how far is a body at this place from the nearest wall or obstacle,
+and what does the camera see from this pose. It never steps time, so nothing it remembers from
+earlier questions can influence an answer (A2). For the same reason a scene never changes: where
+something is placed or removed, another scene is built.
 """
 
 from __future__ import annotations
 
 import math
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -18,12 +20,12 @@ import numpy.typing as npt
 import pybullet
 
 from services.robot_driver.robot import Pose
-from services.robot_driver.textures import flat_tile, wall_picture
-from services.robot_driver.world import Surface, Wall, World
+from services.robot_driver.textures import box_picture, flat_tile, wall_picture
+from services.robot_driver.world import Floats, Obstacle, Surface, World
 from shared.config import CameraConfig
 
 REACH_M = 0.5
-"""Walls farther away than this are not measured."""
+"""Walls and obstacles farther away than this are not measured."""
 
 _WALL_THICKNESS_M = 0.1
 _BUMPER_HEIGHT_M = 0.1
@@ -34,38 +36,56 @@ _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 _SQUARE = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
 
 
+class _Solid(NamedTuple):
+    """An upright box: half its sizes, its middle, and where its first axis points."""
+
+    half: tuple[float, float, float]
+    centre: tuple[float, float, float]
+    heading_rad: float
+
+
 class Scene:
-    """Solid and textured walls, a round body to measure with, and a camera.
+    """Solid and textured walls and obstacles, a round body to measure with, and a camera.
 
     Args:
         world: What to build.
         radius_m: Radius of the robot's round shell.
         camera: Height, place, field of view and size of pictures (A1, E31).
+        obstacles: What stands in it; by default what the world begins with.
     """
 
-    def __init__(self, world: World, radius_m: float, camera: CameraConfig) -> None:
+    def __init__(
+        self,
+        world: World,
+        radius_m: float,
+        camera: CameraConfig,
+        obstacles: Sequence[Obstacle] | None = None,
+    ) -> None:
+        obstacles = world.obstacles if obstacles is None else obstacles
         self._camera = camera
         self._closed = False
         # Apart, because the renderer would draw solid bodies as well.
         self._solid, self._seen = _connect(), _connect()
-        self._walls = self._add_solids(world)
+        self._obstructions = self._add_solids(
+            [*_behind_walls(world), *(_inside(obstacle) for obstacle in obstacles)]
+        )
         self._body = self._add_body(radius_m)
         with tempfile.TemporaryDirectory(prefix="textures-") as folder:
-            self._add_pictures(world, Path(folder))
+            self._add_pictures(world, obstacles, Path(folder))
         self._projection = pybullet.computeProjectionMatrixFOV(
             camera.vertical_fov_deg, camera.aspect, _NEAR_M, _FAR_M
         )
 
     def clearance(self, x_m: float, y_m: float) -> float:
-        """Gap between the shell at (x_m, y_m) and the nearest wall; at most `REACH_M`.
+        """Gap between the shell at (x_m, y_m) and the nearest wall or obstacle, at most `REACH_M`.
 
-        Negative inside a wall. Depends on the arguments only.
+        Negative inside one. Depends on the arguments only.
         """
         place = (x_m, y_m, _BUMPER_HEIGHT_M)
         pybullet.resetBasePositionAndOrientation(self._body, place, _UPRIGHT, **self._solid)
         gap = REACH_M
-        for wall in self._walls:
-            for point in pybullet.getClosestPoints(self._body, wall, REACH_M, **self._solid):
+        for body in self._obstructions:
+            for point in pybullet.getClosestPoints(self._body, body, REACH_M, **self._solid):
                 gap = min(gap, float(point[8]))
         return gap
 
@@ -114,26 +134,18 @@ class Scene:
         )
         return self._solid_body(shape)
 
-    def _add_solids(self, world: World) -> list[int]:
-        """Boxes behind the visible faces, several to a body because that is faster to ask."""
+    def _add_solids(self, solids: Sequence[_Solid]) -> list[int]:
+        """Bodies of several boxes each, because that is faster to ask."""
         bodies = []
-        for first in range(0, len(world.segments), _SHAPES_PER_BODY):
-            part = world.segments[first : first + _SHAPES_PER_BODY]
-            halves, centres, turns = [], [], []
-            for ax, ay, bx, by in part:
-                dx, dy = bx - ax, by - ay
-                length = math.hypot(dx, dy)
-                back = _WALL_THICKNESS_M / 2 / length
-                centres.append(
-                    ((ax + bx) / 2 + dy * back, (ay + by) / 2 - dx * back, world.height_m / 2)
-                )
-                halves.append((length / 2, _WALL_THICKNESS_M / 2, world.height_m / 2))
-                turns.append(pybullet.getQuaternionFromEuler((0.0, 0.0, math.atan2(dy, dx))))
+        for first in range(0, len(solids), _SHAPES_PER_BODY):
+            part = solids[first : first + _SHAPES_PER_BODY]
             shape = pybullet.createCollisionShapeArray(
                 shapeTypes=[pybullet.GEOM_BOX] * len(part),
-                halfExtents=halves,
-                collisionFramePositions=centres,
-                collisionFrameOrientations=turns,
+                halfExtents=[solid.half for solid in part],
+                collisionFramePositions=[solid.centre for solid in part],
+                collisionFrameOrientations=[
+                    pybullet.getQuaternionFromEuler((0.0, 0.0, solid.heading_rad)) for solid in part
+                ],
                 **self._solid,
             )
             bodies.append(self._solid_body(shape))
@@ -145,23 +157,33 @@ class Scene:
         pybullet.changeDynamics(body, -1, collisionMargin=0.0, **self._solid)
         return body
 
-    def _add_pictures(self, world: World, folder: Path) -> None:
+    def _add_pictures(self, world: World, obstacles: Sequence[Obstacle], folder: Path) -> None:
         for wall in world.walls:
-            for i in range(len(wall.points)):
-                self._add_wall(world, wall, i, folder)
+            for i, segment in enumerate(wall.segments):
+                self._add_side(segment, world.height_m, wall_picture(world, wall, i), folder)
         x0, y0, x1, y1 = world.bounds
         low = [(x0, y0, 0.0), (x1, y0, 0.0), (x1, y1, 0.0), (x0, y1, 0.0)]
         high = [(x, y, world.height_m) for x, y, _ in reversed(low)]
         self._add_flat(world, world.floor, low, folder)
         self._add_flat(world, world.ceiling, high, folder)
+        for obstacle in obstacles:
+            self._add_box(obstacle, folder)
 
-    def _add_wall(self, world: World, wall: Wall, index: int, folder: Path) -> None:
-        ax, ay, bx, by = wall.segments[index]
-        picture = wall_picture(world, wall, index)
-        # Seen from the free side, the segment runs from right to left.
-        corners = [
-            (bx, by, 0.0), (ax, ay, 0.0), (ax, ay, world.height_m), (bx, by, world.height_m),
-        ]  # fmt: skip
+    def _add_box(self, obstacle: Obstacle, folder: Path) -> None:
+        for segment in obstacle.segments:
+            ax, ay, bx, by = segment
+            length, angle = math.hypot(bx - ax, by - ay), math.atan2(by - ay, bx - ax)
+            picture = box_picture(length, obstacle.height_m, obstacle.rgb, angle)
+            self._add_side(segment, obstacle.height_m, picture, folder)
+        top = [(x, y, obstacle.height_m) for x, y in obstacle.corners]
+        self._add_quad(top, list(_SQUARE), np.full((8, 8, 3), obstacle.rgb, np.uint8), folder)
+
+    def _add_side(
+        self, segment: Floats, height_m: float, picture: npt.NDArray[np.uint8], folder: Path
+    ) -> None:
+        """An upright picture from the floor up. Seen, the segment runs from right to left."""
+        ax, ay, bx, by = segment
+        corners = [(bx, by, 0.0), (ax, ay, 0.0), (ax, ay, height_m), (bx, by, height_m)]
         self._add_quad(corners, list(_SQUARE), picture, folder)
 
     def _add_flat(
@@ -201,6 +223,32 @@ class Scene:
         cv2.imwrite(str(path), np.ascontiguousarray(picture[:, :, ::-1]))
         texture = pybullet.loadTexture(str(path), **self._seen)
         pybullet.changeVisualShape(body, -1, textureUniqueId=texture, **self._seen)
+
+
+def _behind_walls(world: World) -> list[_Solid]:
+    """Boxes behind the visible faces of the walls."""
+    solids = []
+    for ax, ay, bx, by in world.segments:
+        dx, dy = bx - ax, by - ay
+        length = math.hypot(dx, dy)
+        back = _WALL_THICKNESS_M / 2 / length
+        solids.append(
+            _Solid(
+                (length / 2, _WALL_THICKNESS_M / 2, world.height_m / 2),
+                ((ax + bx) / 2 + dy * back, (ay + by) / 2 - dx * back, world.height_m / 2),
+                math.atan2(dy, dx),
+            )
+        )
+    return solids
+
+
+def _inside(obstacle: Obstacle) -> _Solid:
+    half_height = obstacle.height_m / 2
+    return _Solid(
+        (obstacle.length_m / 2, obstacle.width_m / 2, half_height),
+        (obstacle.x_m, obstacle.y_m, half_height),
+        math.radians(obstacle.heading_deg),
+    )
 
 
 def _connect() -> dict[str, int]:

@@ -1,21 +1,32 @@
 """The simulated robot: kinematic motion in small steps, a ring bumper and a camera (A1, A2).
 
-What happens next depends on `state()` alone: on pose, velocity, time and laps. PyBullet is only
-asked how far the nearest wall is and what the camera sees, so a robot restored in another process
-continues bit for bit.
+What happens next depends on `state()` alone: on world and obstacles, pose, velocity, time and laps.
+PyBullet is only asked how far the nearest wall or obstacle is and what the camera sees, so a robot
+restored in another process continues bit for bit. Between actions the world may be changed:
+obstacles placed and removed, or another world put in its place.
 """
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import TypeAdapter, ValidationError
 
 from services.robot_driver.robot import STANDSTILL, Felt, Pose, Sensed, Velocity
 from services.robot_driver.scene import Scene
-from services.robot_driver.world import World
+from services.robot_driver.world import (
+    MAX_OBSTACLES,
+    Obstacle,
+    Start,
+    World,
+    WorldError,
+    load_world,
+)
 from shared.config import RobotConfig
 from shared.rl.preprocess import preprocess
 
@@ -26,6 +37,7 @@ SKIN_M = 0.001
 """The bumper is pressed while the gap to a wall is at most this."""
 GAP_M = 0.0002
 """The shell never comes nearer to a wall than this."""
+_OBSTACLES = TypeAdapter(tuple[Obstacle, ...])
 _HALVINGS = 6
 """Of a substep that would touch: what is left of 1 cm is well inside the skin."""
 
@@ -73,17 +85,15 @@ class SimRobot:
         self.config = config
         self.world = world
         self.seed = seed
-        start = world.starts[0]
-        self._pose = Pose(start.x_m, start.y_m, wrap(math.radians(start.heading_deg)))
+        self.obstacles = world.obstacles
+        """What stands in the world now, in the order in which it was placed."""
+        self._pose = _pose_of(world.starts[0])
         self._velocity = STANDSTILL
         self._time_s = 0.0
         self._winding_rad = 0.0
         self._lap_start_rad = 0.0
         self._left = self._right = 0
-        self._scene = Scene(world, config.radius_m, config.camera)
-        if self._clearance(self._pose) <= SKIN_M:
-            self._scene.close()
-            raise ValueError(f"world {world.name!r}: starts.0 touches a wall")
+        self._scene = self._at_start(world, 0)
 
     @property
     def pose(self) -> Pose:
@@ -145,11 +155,54 @@ class SimRobot:
         """Simulated time since the start."""
         return self._time_s
 
+    def place(self, obstacle: Obstacle) -> None:
+        """Let a box stand in the world from now on.
+
+        Raises:
+            ValueError: One of that name stands there, it does not fit into the world, it overlaps
+                the robot, or there are too many. Nothing has changed then.
+        """
+        if any(other.name == obstacle.name for other in self.obstacles):
+            raise ValueError(f"there is already an obstacle {obstacle.name!r}")
+        if len(self.obstacles) >= MAX_OBSTACLES:
+            raise ValueError(f"there are {MAX_OBSTACLES} obstacles already")
+        self.world.check_obstacle(obstacle)
+        obstacles = (*self.obstacles, obstacle)
+        complaint = f"obstacle {obstacle.name!r} would overlap the robot"
+        self._show(self._built(self.world, obstacles, self._pose, GAP_M, complaint))
+        self.obstacles = obstacles
+
+    def remove(self, name: str) -> None:
+        """Take an obstacle away. Raises ValueError when there is none of that name."""
+        obstacles = tuple(other for other in self.obstacles if other.name != name)
+        if len(obstacles) == len(self.obstacles):
+            raise ValueError(f"there is no obstacle {name!r}")
+        self._show(Scene(self.world, self.config.radius_m, self.config.camera, obstacles))
+        self.obstacles = obstacles
+
+    def switch(self, world: World, start: int = 0) -> None:
+        """Stand still at a start pose of another world; its laps count on from the old ones'.
+
+        Raises:
+            ValueError: There is no such start pose, or it touches something. Nothing has changed
+                then.
+        """
+        if not 0 <= start < len(world.starts):
+            raise ValueError(
+                f"world {world.name!r}: expected a start from 0 to {len(world.starts) - 1}, "
+                f"got {start}"
+            )
+        self._show(self._at_start(world, start))
+        self.world, self.obstacles = world, world.obstacles
+        self._pose, self._velocity = _pose_of(world.starts[start]), STANDSTILL
+        self._winding_rad = self._lap_start_rad = 0.0
+
     def state(self) -> dict[str, float | int | str]:
         """Everything that decides what happens next."""
         return {
             "world": self.world.name,
             "world_fingerprint": self.world.fingerprint,
+            "obstacles": json.dumps([obstacle.model_dump() for obstacle in self.obstacles]),
             "x_m": self._pose.x_m,
             "y_m": self._pose.y_m,
             "heading_rad": self._pose.heading_rad,
@@ -164,24 +217,23 @@ class SimRobot:
         }
 
     def restore(self, state: dict[str, float | int | str]) -> None:
-        """Continue from `state()`.
+        """Continue from `state()`, in its world.
 
         Raises:
-            ValueError: Another world, a missing or wrong value, or a pose inside a wall. The robot
-                is unchanged then.
+            ValueError: A world that is not there or has changed, a missing or wrong value, or a
+                pose inside a wall or an obstacle. The robot is unchanged then.
         """
         if set(state) != set(self.state()):
             odd = sorted(set(state) ^ set(self.state()))
             raise ValueError(f"robot state: missing or unknown {', '.join(odd)}")
-        if state["world_fingerprint"] != self.world.fingerprint:
-            raise ValueError(f"robot state: is of another world than {self.world.name!r}")
+        world, obstacles = self._world_of(state), _obstacles_of(state)
         pose = Pose(*(_number(state, key) for key in ("x_m", "y_m", "heading_rad")))
-        if self._clearance(pose) < GAP_M or not self._inside(pose):
-            raise ValueError(f"robot state: ({pose.x_m}, {pose.y_m}) is inside a wall")
-        velocity = (_number(state, key) for key in ("forward_m_s", "left_m_s", "turn_rad_s"))
+        speeds = ("forward_m_s", "left_m_s", "turn_rad_s")
+        velocity = Velocity(*(_number(state, key) for key in speeds))
         times = [_number(state, key) for key in ("time_s", "winding_rad", "lap_start_rad")]
         laps = [int(_number(state, key)) for key in ("laps_left", "laps_right")]
-        self._pose, self._velocity = pose, Velocity(*velocity)
+        self._put(world, obstacles, pose)
+        self._pose, self._velocity = pose, velocity
         self._time_s, self._winding_rad, self._lap_start_rad = times
         self._left, self._right = laps
 
@@ -243,8 +295,62 @@ class SimRobot:
     def _clearance(self, pose: Pose) -> float:
         return self._scene.clearance(pose.x_m, pose.y_m)
 
-    def _inside(self, pose: Pose) -> bool:
-        return bool(self.world.free(np.array([[pose.x_m, pose.y_m]]))[0])
+    def _built(
+        self,
+        world: World,
+        obstacles: Sequence[Obstacle],
+        pose: Pose,
+        least_gap_m: float,
+        complaint: str,
+    ) -> Scene:
+        """A scene where a robot at this pose keeps that gap; else a ValueError with `complaint`."""
+        scene = Scene(world, self.config.radius_m, self.config.camera, obstacles)
+        if scene.clearance(pose.x_m, pose.y_m) < least_gap_m:
+            scene.close()
+            raise ValueError(complaint)
+        return scene
+
+    def _at_start(self, world: World, start: int) -> Scene:
+        pose = _pose_of(world.starts[start])
+        complaint = f"world {world.name!r}: starts.{start} touches a wall or an obstacle"
+        return self._built(world, world.obstacles, pose, SKIN_M, complaint)
+
+    def _show(self, scene: Scene) -> None:
+        self._scene.close()
+        self._scene = scene
+
+    def _put(self, world: World, obstacles: tuple[Obstacle, ...], pose: Pose) -> None:
+        """Be in this world; the pose is not taken up but must be possible there."""
+        complaint = f"robot state: ({pose.x_m}, {pose.y_m}) is inside a wall or an obstacle"
+        if not bool(world.between_walls(np.array([[pose.x_m, pose.y_m]]))[0]):
+            raise ValueError(complaint)
+        if (world, obstacles) != (self.world, self.obstacles):
+            self._show(self._built(world, obstacles, pose, GAP_M, complaint))
+            self.world, self.obstacles = world, obstacles
+        elif self._clearance(pose) < GAP_M:
+            raise ValueError(complaint)
+
+    def _world_of(self, state: dict[str, float | int | str]) -> World:
+        """The world that the state was saved in: the one at hand, or another that comes along."""
+        try:
+            same = state["world_fingerprint"] == self.world.fingerprint
+            world = self.world if same else load_world(str(state["world"]))
+        except WorldError as error:
+            raise ValueError(f"robot state: {error}") from error
+        if state["world_fingerprint"] != world.fingerprint:
+            raise ValueError(f"robot state: is of another world {world.name!r} than there is now")
+        return world
+
+
+def _pose_of(start: Start) -> Pose:
+    return Pose(start.x_m, start.y_m, wrap(math.radians(start.heading_deg)))
+
+
+def _obstacles_of(state: dict[str, float | int | str]) -> tuple[Obstacle, ...]:
+    try:
+        return _OBSTACLES.validate_json(str(state["obstacles"]))
+    except ValidationError as error:
+        raise ValueError(f"robot state: obstacles: {error.errors()[0]['msg']}") from error
 
 
 def _number(state: dict[str, float | int | str], key: str) -> float:

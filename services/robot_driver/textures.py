@@ -53,6 +53,13 @@ def flat_tile(texture: Texture) -> tuple[Picture, float]:
     return _finish(canvas), _TILE_M
 
 
+def box_picture(length_m: float, height_m: float, rgb: Colour, angle_rad: float) -> Picture:
+    """One side of a box of one colour, lit like a wall whose segment has this direction."""
+    canvas = _blank(length_m, height_m, rgb)
+    _light(canvas, angle_rad)
+    return _finish(canvas)
+
+
 def _blank(width_m: float, height_m: float, rgb: Colour) -> Canvas:
     shape = (_texels(height_m) * _OVERSAMPLING, _texels(width_m) * _OVERSAMPLING, 3)
     return np.full(shape, rgb, np.float32)

@@ -37,6 +37,7 @@ _POINTS_AT_ONCE = 8192
 Floats = npt.NDArray[np.float64]
 Text = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,40}$")]
 Length = Annotated[float, Field(gt=0.0, le=100.0)]
+Side = Annotated[float, Field(ge=0.01, le=100.0)]
 Coordinate = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 Point = Annotated[tuple[Coordinate, Coordinate], Field(strict=False)]
 Channel = Annotated[int, Field(ge=0, le=255)]
@@ -143,9 +144,9 @@ class Obstacle(_Part):
     y_m: Coordinate
     heading_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
     """Direction along which `length_m` is measured."""
-    length_m: Length
-    width_m: Length
-    height_m: Length
+    length_m: Side
+    width_m: Side
+    height_m: Side
     rgb: Colour
 
     @property

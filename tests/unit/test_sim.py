@@ -45,7 +45,7 @@ def fresh(robot: SimRobot) -> SimRobot:
 
 def place(robot: SimRobot, x: float, y: float, heading: float) -> None:
     zero = dict.fromkeys(robot.state(), 0)
-    names = {"world": WORLD.name, "world_fingerprint": WORLD.fingerprint}
+    names = {"world": WORLD.name, "world_fingerprint": WORLD.fingerprint, "obstacles": "[]"}
     robot.restore({**zero, **names, "x_m": x, "y_m": y, "heading_rad": heading})
 
 
@@ -215,6 +215,9 @@ def test_states_that_do_not_fit_are_refused_and_change_nothing(robot: SimRobot):
         ({**good, "x_m": 4.8}, "inside a wall"),
         ({**good, "x_m": 50.0}, "inside a wall"),
         ({**good, "x_m": math.nan}, "x_m must be a finite number"),
+        ({**good, "world": "maze", "world_fingerprint": "0" * 16}, "no world named 'maze'"),
+        ({**good, "obstacles": "[{}]"}, "obstacles: Field required"),
+        ({**good, "obstacles": "boxes"}, "obstacles: Invalid JSON"),
         ({**good, "time_s": "soon"}, "time_s must be a finite number"),
     ]
     for state, message in bad:
