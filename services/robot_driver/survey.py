@@ -31,6 +31,8 @@ COMFORTABLE_M = 0.4
 """Room to all walls on the lap that stands for an ordinary driving line."""
 _RECOVERIES = 1000
 _RACE_ACTIONS = 600
+_SPACING_M = 0.1
+"""Distance of the places at which the width is measured."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,7 @@ def survey(config: Config) -> Figures:
     return {
         "world": world.name,
         **_geometry(world, motion),
+        **_best_run(planner),
         **_laps(planner),
         **_random_figures(driven),
         **_saved(planner, driven),
@@ -99,18 +102,22 @@ def drive_randomly(robot: SimRobot, bumps: int, seed: int) -> RandomDrive:
     return RandomDrive(np.array(runs), np.array(poses), np.array(retreats), spent / done)
 
 
-def corridor_width(world: World, spacing_m: float = 0.1) -> float:
-    """Smallest distance straight across from any wall to the wall opposite it."""
-    narrowest = math.inf
-    for ax, ay, bx, by in world.segments:
-        length = math.hypot(bx - ax, by - ay)
-        part = (np.arange(max(1, round(length / spacing_m))) + 0.5) * spacing_m / length
-        part = part[part < 1.0]
-        points = np.column_stack([ax + part * (bx - ax), ay + part * (by - ay)])
-        across = np.full(len(points), math.atan2(bx - ax, -(by - ay)))
-        if len(points):
-            narrowest = min(narrowest, float(world.sight(points, across).min()))
-    return narrowest
+def corridor_width(world: World) -> float:
+    """Smallest distance straight across from any wall to what stands opposite it."""
+    return min(float(_widths(world, segment).min()) for segment in world.segments)
+
+
+def _widths(world: World, segment: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Distances straight across from places on one wall segment; inf where an obstacle stands."""
+    ax, ay, bx, by = segment
+    along = np.array([bx - ax, by - ay])
+    length = float(np.hypot(*along))
+    part = (np.arange(max(1, round(length / _SPACING_M))) + 0.5) * _SPACING_M / length
+    points = (ax, ay) + np.minimum(part, 0.5 if len(part) == 1 else 1.0)[:, None] * along
+    across = np.array([-along[1], along[0]]) / length
+    far = world.sight(points, np.full(len(points), math.atan2(across[1], across[0])))
+    bare = world.clearance(points + 0.01 * across) > 0.005  # else along the side of an obstacle
+    return np.where(bare, far, np.inf)
 
 
 def _geometry(world: World, motion: Motion) -> Figures:
@@ -129,19 +136,23 @@ def _geometry(world: World, motion: Motion) -> Figures:
     }
 
 
+def _best_run(planner: Planner) -> Figures:
+    first = _start_poses(planner.world)[:1]
+    return {"best_fitness_from_start": int(planner.drive(first, PLANNED_ACTIONS).survived[0])}
+
+
 def _laps(planner: Planner) -> Figures:
     world = planner.world
     if world.lap is None:
         return {}
     figures: Figures = {}
-    if len(world.walls) == 2:  # the middle between boundary and island
-        middle = sum(float(wall.lengths.sum()) for wall in world.walls) / 2.0
+    if len(world.walls) == 2:
+        middle = _centre_line_lap(world)
         figures["centre_line_lap_m"] = middle
         figures["centre_line_lap_actions"] = middle / planner.motion.step_m
-    start = world.starts[0]
-    pose = np.array([start.x_m, start.y_m, math.radians(start.heading_deg)])
-    first = int(planner.drive(pose[None, :], PLANNED_ACTIONS).survived[0])
-    figures["best_fitness_from_start"] = first
+    starts = _start_poses(world)
+    line = np.mean(world.lap.line, axis=0)
+    pose = starts[int(np.argmin(np.hypot(*(starts[:, :2] - line).T)))]
     for name, direction, keep in (
         ("fastest_lap_left_actions", 1, 0.005),
         ("fastest_lap_right_actions", -1, 0.005),
@@ -153,6 +164,23 @@ def _laps(planner: Planner) -> Figures:
         laps = direction * angle / (2.0 * math.pi)
         figures[name] = survived / laps if laps > 0.5 else math.inf
     return figures
+
+
+def _centre_line_lap(world: World) -> float:
+    """Length of a lap at half the width of the narrowest side from the one island, cornered."""
+    island = world.walls[1]
+    width = min(float(np.median(_widths(world, segment))) for segment in island.segments)
+    ways = np.diff(np.array([*island.points, *island.points[:2]], np.float64), axis=0)
+    turns = np.diff(np.arctan2(ways[:, 1], ways[:, 0]))
+    # Clockwise, so a corner that sticks out turns right and makes the way longer.
+    mitres = np.tan(-np.remainder(turns + np.pi, 2 * np.pi) / 2.0 + np.pi / 2.0)
+    return float(island.lengths.sum() + width * mitres.sum())
+
+
+def _start_poses(world: World) -> npt.NDArray[np.float64]:
+    """x, y, heading of all starts, float64 [n, 3]."""
+    poses = [(s.x_m, s.y_m, math.radians(s.heading_deg)) for s in world.starts]
+    return np.array(poses, np.float64)
 
 
 def _random_figures(driven: RandomDrive) -> Figures:

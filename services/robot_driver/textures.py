@@ -20,6 +20,8 @@ Picture = npt.NDArray[np.uint8]
 """uint8 [h, w, 3], RGB, first row at the top."""
 Canvas = npt.NDArray[np.float32]
 """float32 [h, w, 3], RGB from 0 to 255, at drawing resolution."""
+Box = tuple[float, float, float, float]
+"""Left, bottom, width, height in metres."""
 
 TEXELS_PER_M = 32
 _OVERSAMPLING = 4
@@ -38,11 +40,15 @@ def wall_picture(world: World, wall: Wall, segment: int) -> Picture:
     texture = world.textures[wall.texture_of(segment)]
     canvas = _blank(length, world.height_m, texture.rgb)
     _MATERIALS[texture.kind](canvas, texture)
-    for fixture in world.fixtures:
-        if fixture.wall == wall.name and fixture.segment == segment:
+    here = [f for f in world.fixtures if f.wall == wall.name and f.segment == segment]
+    for fixture in here:
+        if fixture.kind not in _LUMINOUS:
             _FIXTURES[fixture.kind](canvas, fixture, length, world.height_m)
     ax, ay, bx, by = wall.segments[segment]
     _light(canvas, math.atan2(by - ay, bx - ax))
+    for fixture in here:
+        if fixture.kind in _LUMINOUS:
+            _FIXTURES[fixture.kind](canvas, fixture, length, world.height_m)
     return _finish(canvas)
 
 
@@ -220,15 +226,40 @@ def _strip_light(canvas: Canvas, texture: Texture) -> None:
 
 
 def _door(canvas: Canvas, fixture: Fixture, length: float, height: float) -> None:
-    """Frame, leaf with two fields, handle."""
+    """Frame, leaf in one of three styles, handle."""
     del height
     x, y, w, h = _place(fixture, length)
     _box(canvas, x, y, w, h, _mix(fixture.rgb, 0.45))
     _box(canvas, x + 0.07, y, w - 0.14, h - 0.07, fixture.rgb)
-    for bottom, tall in ((0.2, 0.65), (1.15, h - 1.45)):
-        if tall > 0:
-            _box(canvas, x + 0.2, y + bottom, w - 0.4, tall, _mix(fixture.rgb, 0.8))
+    _LEAVES[fixture.style or "panelled"](canvas, fixture, (x + 0.07, y, w - 0.14, h - 0.07))
     _box(canvas, x + w - 0.2, y + 1.0, 0.12, 0.05, (220, 220, 210))
+
+
+def _panelled_leaf(canvas: Canvas, fixture: Fixture, leaf: Box) -> None:
+    """Two fields, one above the other."""
+    x, y, w, h = leaf
+    for bottom, tall in ((0.2, 0.65), (1.15, h - 1.38)):
+        if tall > 0:
+            _box(canvas, x + 0.13, y + bottom, w - 0.26, tall, _mix(fixture.rgb, 0.8))
+
+
+def _flush_leaf(canvas: Canvas, fixture: Fixture, leaf: Box) -> None:
+    """Smooth, with a kick plate and a narrow pane above the handle."""
+    x, y, w, _ = leaf
+    _box(canvas, x + 0.05, y + 0.05, w - 0.1, 0.2, (176, 178, 180))
+    _box(canvas, x + w - 0.3, y + 1.15, 0.12, 0.6, (206, 220, 226))
+    _box(canvas, x, y + 0.6, w, 0.05, _mix(fixture.rgb, 0.75))
+
+
+def _chevron_leaf(canvas: Canvas, fixture: Fixture, leaf: Box) -> None:
+    """Bands that rise towards the middle, in the door's colour and white."""
+    del fixture
+    x, y, w, h = (round(length * _DRAW) for length in leaf)
+    bottom = canvas.shape[0] - y
+    part = canvas[bottom - h : bottom, x : x + w]
+    rows, columns = np.mgrid[0 : part.shape[0], 0 : part.shape[1]]
+    rise = np.abs(columns - part.shape[1] / 2)
+    part[((rows - rise) // (0.2 * _DRAW)) % 2 == 0] = (248, 248, 244)
 
 
 def _window(canvas: Canvas, fixture: Fixture, length: float, height: float) -> None:
@@ -242,6 +273,21 @@ def _window(canvas: Canvas, fixture: Fixture, length: float, height: float) -> N
         _box(canvas, x + (w - 0.06) * k / 2, y, 0.06, h, fixture.rgb)
     _box(canvas, x, y + h - 0.06, w, 0.06, fixture.rgb)
     _box(canvas, x - 0.05, y - 0.06, w + 0.1, 0.06, _mix(fixture.rgb, 0.7))
+
+
+def _glazing(canvas: Canvas, fixture: Fixture, length: float, height: float) -> None:
+    """A glass front with daylight behind it: brightest overhead, between dark mullions."""
+    del height
+    x, y, w, h = _place(fixture, length)
+    _box(canvas, x, y, w, h, fixture.rgb)
+    panes = max(1, round(w / 0.9))
+    wide = w / panes
+    for k, band in itertools.product(range(panes), range(12)):
+        light = band / 11
+        rgb = (round(206 + 49 * light), round(220 + 35 * light), round(232 + 20 * light))
+        _box(canvas, x + k * wide + 0.05, y + 0.06 + (h - 0.12) * band / 12,
+             wide - 0.1, (h - 0.12) / 12, rgb)  # fmt: skip
+    _box(canvas, x, y + h * 0.3, w, 0.06, fixture.rgb)
 
 
 def _board(canvas: Canvas, fixture: Fixture, length: float, height: float) -> None:
@@ -268,7 +314,7 @@ def _radiator(canvas: Canvas, fixture: Fixture, length: float, height: float) ->
     _box(canvas, x, y + h - 0.05, w, 0.05, fixture.rgb)
 
 
-def _place(fixture: Fixture, length: float) -> tuple[float, float, float, float]:
+def _place(fixture: Fixture, length: float) -> Box:
     """Left, bottom, width, height in the picture, where the segment runs from right to left."""
     left = length - fixture.at_m - fixture.width_m / 2
     return left, fixture.bottom_m, fixture.width_m, fixture.height_m
@@ -289,6 +335,14 @@ _MATERIALS: dict[str, Callable[[Canvas, Texture], None]] = {
 _FIXTURES: dict[str, Callable[[Canvas, Fixture, float, float], None]] = {
     "door": _door,
     "window": _window,
+    "glazing": _glazing,
     "board": _board,
     "radiator": _radiator,
+}
+_LUMINOUS = ("glazing",)
+"""Fixtures with light of their own: the light of the wall does not dim them."""
+_LEAVES: dict[str, Callable[[Canvas, Fixture, Box], None]] = {
+    "panelled": _panelled_leaf,
+    "flush": _flush_leaf,
+    "chevron": _chevron_leaf,
 }

@@ -49,7 +49,8 @@ Material = Literal[
 ]  # fmt: skip
 """Six for walls, two for floors, two for ceilings; any may be used anywhere."""
 PlaceKind = Literal["dead-end", "bridge", "junction", "window", "door", "obstacle", "corridor"]
-FixtureKind = Literal["door", "window", "board", "radiator"]
+FixtureKind = Literal["door", "window", "glazing", "board", "radiator"]
+DoorStyle = Literal["panelled", "flush", "chevron"]
 
 
 class WorldError(Exception):
@@ -133,6 +134,21 @@ class Fixture(_Part):
     bottom_m: Annotated[float, Field(ge=0.0)] = 0.0
     """Height of its lower edge above the floor."""
     rgb: Colour
+    style: DoorStyle | None = None
+    """Of a door; panelled unless given."""
+    name: Text | None = None
+    """Stands on the map instead of the kind."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.kind != "door" and self.style is not None:
+            raise ValueError(f"style: only doors have one, this is a {self.kind}")
+        return self
+
+    @property
+    def look(self) -> tuple[str, str, Colour]:
+        """What tells it from others: kind, style, colour."""
+        return self.kind, self.style or "panelled", self.rgb
 
 
 class Obstacle(_Part):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from services.robot_driver.textures import TEXELS_PER_M, flat_tile, wall_picture
-from services.robot_driver.world import Material, Texture, World, load_world
+from services.robot_driver.world import DoorStyle, Material, Texture, World, load_world
 
 WORLD = load_world("plus")
 PLACES = [(wall, i) for wall in WORLD.walls for i in range(len(wall.points))]
@@ -79,3 +79,32 @@ def test_light_depends_on_the_direction_of_the_wall():
     world = World.model_validate(tree)
     means = [wall_picture(world, world.walls[0], i)[:, 20:36].mean() for i in (0, 3, 6, 9)]
     assert len({round(mean) for mean in means}) == 4
+
+
+def with_fixture(segment: int, **fixture: object) -> World:
+    """Plus with one fixture only, in the middle of a segment of its boundary."""
+    tree = WORLD.model_dump()
+    at = {"wall": "outer", "segment": segment, "at_m": 3.1, "width_m": 1.4, "rgb": (40, 90, 140)}
+    tree["fixtures"] = [{**at, "height_m": 2.2, **fixture}]
+    return World.model_validate(tree)
+
+
+def test_glazing_is_as_bright_on_a_dark_wall_as_on_a_bright_one():
+    means = []
+    for segment in (0, 6):
+        world = with_fixture(segment, kind="glazing")
+        picture = wall_picture(world, world.walls[0], segment)
+        middle = round(3.1 * TEXELS_PER_M)
+        means.append(picture[20:70, middle - 18 : middle + 18].mean())
+    assert means[0] == pytest.approx(means[1], abs=1.0)
+    assert means[0] > 190
+
+
+def test_doors_of_each_style_look_different_even_in_one_colour():
+    pictures = []
+    for style in get_args(DoorStyle):
+        world = with_fixture(0, kind="door", style=style)
+        pictures.append(wall_picture(world, world.walls[0], 0).astype(float).mean(axis=2))
+    for a, b in itertools.combinations(pictures, 2):
+        changed = np.abs(a - b) > 10
+        assert changed.sum() > 0.05 * 1.4 * 2.2 * TEXELS_PER_M**2

@@ -68,6 +68,8 @@ def test_reading_twice_gives_the_same_world_and_a_change_another_fingerprint(tmp
         ('kind = "door"', 'kind = "gate"', "fixtures.0.kind: Input should be 'door'"),
         ("rgb = [72, 96, 132]", "rgb = [72, 96, 256]", "fixtures.0.rgb.2: "),
         ("at_m = 1.0", "at_m = true", "fixtures.0.at_m: "),
+        ("at_m = 1.0", 'at_m = 1.0\nstyle = "round"', "fixtures.0.style: Input should be"),
+        ("at_m = 2.9", 'at_m = 2.9\nstyle = "flush"', "fixtures.1: style: only doors have one"),
     ],
 )
 def test_wrong_files_are_refused_with_one_line_naming_file_and_key(

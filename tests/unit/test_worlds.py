@@ -1,11 +1,13 @@
 """The worlds that come along: what each of them is for is really possible in it (A3)."""
 
 import math
+from collections import Counter
 
 import numpy as np
 import pytest
 
 from services.robot_driver.planner import Motion, Planner
+from services.robot_driver.survey import corridor_width
 from services.robot_driver.world import WORLDS, World, load_world
 from shared.config import RobotConfig
 
@@ -43,3 +45,49 @@ def test_in_minus_a_robot_turns_back_at_the_end_by_turning_actions_only():
     planner = Planner(world, MOTION, cell_m=0.1, headings=36, horizon=200)
     run = planner.drive(np.array([[6.3, 0.0, 0.0], [-6.3, 0.0, math.pi]]), 200)
     assert run.survived.tolist() == [200, 200]
+
+
+def test_i16c_is_narrow_everywhere_and_its_one_chevron_door_is_the_only_unique_door():
+    world = load_world("i16c")
+    assert corridor_width(world) > 2 * MOTION.radius_m + 0.3
+    circle = 2 * (MOTION.turning_radius_m + MOTION.radius_m)
+    # A corridor of 1.2 m: no wall is as far as a U-turn needs, except along corridors.
+    assert circle > 1.2
+    doors = Counter(f.look for f in world.fixtures if f.kind == "door")
+    once = [look for look, count in doors.items() if count == 1]
+    assert [style for _, style, _ in once] == ["chevron"]
+    assert [f.name for f in world.fixtures if f.look == once[0]] == ["office"]
+
+
+def test_the_tour_of_i16c_is_long_crosses_two_bridges_and_has_a_junction_near_its_end():
+    route = load_world("i16c").route
+    assert route is not None
+    assert route.length_m / MOTION.step_m > 300
+    points = route.sample(0.1)
+    along = {
+        place.name: float(np.argmin(np.hypot(*(points - (place.x_m, place.y_m)).T))) / len(points)
+        for place in route.places
+        if np.hypot(*(points - (place.x_m, place.y_m)).T).min() < 0.1
+    }
+    kinds = {place.name: place.kind for place in route.places}
+    assert sum(kinds[name] == "bridge" for name in along) == 2
+    assert any(along[name] > 0.85 for name in along if kinds[name] in ("junction", "door"))
+
+
+@pytest.fixture(scope="module")
+def i16c() -> Planner:
+    return Planner(load_world("i16c"), MOTION, cell_m=0.1, headings=36, horizon=120)
+
+
+def test_in_i16c_runs_go_on_for_ever_from_starts_but_not_towards_dead_ends(i16c: Planner):
+    ends = np.array(
+        [
+            [1.5, 0.0, math.pi], [15.6, 0.0, 0.0],
+            [1.2, 5.0, math.pi], [16.0, 5.0, 0.0],
+            [1.2, 10.0, math.pi], [14.5, 10.0, 0.0],
+        ]
+    )  # fmt: skip
+    survived = i16c.drive(ends, 40).survived
+    assert survived.max() < 30
+    tour = i16c.drive(starts(i16c.world)[:1], 300)
+    assert tour.survived[0] == 300
