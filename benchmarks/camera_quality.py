@@ -24,11 +24,14 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from benchmarks import driving
-from benchmarks.driving import Figures
 from benchmarks.frame import Bar, report, table
+from experiments import places
+from experiments.choosers import Chooser, greedy, uniform
+from experiments.environment import CorridorEnv
+from experiments.evaluation import evaluate
 from experiments.provenance import commit
 from experiments.single_process import SingleProcess
+from experiments.traces import Figures
 from services.robot_driver.sim import SimRobot
 from services.robot_driver.world import load_world
 from shared.config import Config
@@ -117,7 +120,7 @@ def settings_of(plan: Plan, seed: int, width: int) -> dict[str, Any]:
     return {
         "seed": seed,
         "width": width,
-        "evaluation": [driving.SEED, driving.ROOM_M, driving.JITTER_RAD],
+        "evaluation": [places.SEED, places.ROOM_M, places.JITTER_RAD],
         **{name: getattr(plan, name) for name in names},
         **{section: configured[section] for section in SECTIONS},
     }
@@ -138,7 +141,7 @@ def learnt(plan: Plan, seed: int, width: int, folder: Path) -> Run:
     try:
         loop = SingleProcess(config, robot)
         learning = learn(loop, plan.actions)
-        driven = drive(plan, config, robot, driving.greedy(loop.acting))
+        driven = drive(plan, loop.env, greedy(loop.acting))
     finally:
         robot.close()
     run: Run = {
@@ -171,20 +174,21 @@ def learn(loop: SingleProcess, actions: int) -> Figures:
     }
 
 
-def drive(plan: Plan, config: Config, robot: SimRobot, chooser: driving.Chooser) -> Figures:
+def drive(plan: Plan, env: CorridorEnv, chooser: Chooser) -> Figures:
     """Figures of all drives without learning."""
-    traces = driving.drives(config, robot, chooser, plan.starts, plan.drive_actions)
-    return driving.figures(traces, config.episode.horizon, config.max_distance_m)
+    done = evaluate(env, chooser, plan.starts, plan.drive_actions)
+    laps_left = sum(trace.laps_left for trace in done.traces)
+    laps_right = sum(trace.laps_right for trace in done.traces)
+    return done.figures | {"laps_left": laps_left, "laps_right": laps_right}
 
 
 def floor(plan: Plan) -> Figures:
     """Figures of random actions on the same drives."""
-    config = config_of(plan, plan.seeds[0], min(HEIGHTS))
-    robot = SimRobot(config.robot, load_world(config.robot.world), 0)
+    env = CorridorEnv(config=config_of(plan, plan.seeds[0], min(HEIGHTS)))
     try:
-        return drive(plan, config, robot, driving.uniform)
+        return drive(plan, env, uniform)
     finally:
-        robot.close()
+        env.close()
 
 
 def store(run: Run, folder: Path) -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import gymnasium
 import torch
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import DQN
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 
-from benchmarks.corridor_env import CorridorEnv
+from experiments.environment import CorridorEnv
 from shared.config import Config
 from shared.rl.network import MAP_HEIGHT, MAP_WIDTH
 
@@ -42,7 +43,7 @@ class Baseline:
 
     def __init__(self, config: Config, batch: int, every: int, random_steps: int) -> None:
         self._threads = torch.get_num_threads()
-        self.env = CorridorEnv(config)
+        self.env = TimeLimit(CorridorEnv(config=config), config.episode.max_samples)
         shape = {
             "features_extractor_class": Trunk,
             "features_extractor_kwargs": {"filters": config.network.filters},

@@ -1,8 +1,9 @@
 """The whole system in one process: the parts wired by function calls, no bus, no disk, no threads.
 
 Read this first: it is the algorithm of Fig 3.2 in the order of E25, made of exactly the parts the
-services are made of. The distributed system in lockstep with synchronous learning computes the same
-actions, rewards, memory, marks and weights, bit for bit; tests/system compares the two.
+services are made of; robot and driver together are the Gymnasium environment that everybody else
+can use too. The distributed system in lockstep with synchronous learning computes the same actions,
+rewards, memory, marks and weights, bit for bit; tests/system compares the two.
 """
 
 from __future__ import annotations
@@ -10,21 +11,20 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
+
+from experiments.environment import LIFE, CorridorEnv
 from services.actor.actor import Actor
 from services.replay import numbering
 from services.replay.numbering import Commit, Counters
-from services.robot_driver.driver import Driver
-from services.robot_driver.robot import Robot
+from services.robot_driver.sim import SimRobot
 from shared.config import Config
-from shared.messages import Episode
+from shared.messages import Episode, Observation
 from shared.rl.learning import Trained, Trainer
 from shared.rl.memory import ReplayMemory
 from shared.rl.network import to_bytes
 from shared.rl.predictor import Predictor
 from shared.rl.turn import Maintenance, maintain, sample_rows
-
-LIFE = "0" * 12
-"""Life ids are random in the services; comparison ignores them."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,9 @@ class TurnDone:
 class SingleProcess:
     """Driver, actor, replay and learner of one robot as plain objects."""
 
-    def __init__(self, config: Config, robot: Robot) -> None:
+    def __init__(self, config: Config, robot: SimRobot) -> None:
         self.config = config
-        self.driver = Driver(config, robot, LIFE)
+        self.env = CorridorEnv(config=config, robot=robot)
         self.acting = Predictor(config.network, config.numerics.actor)
         self.actor = Actor(config, config.robot.id, LIFE, self.acting)
         self.memory = ReplayMemory(config.memory.capacity)
@@ -58,7 +58,7 @@ class SingleProcess:
     def run(self) -> Iterator[TurnDone]:
         """Drive and learn for ever; yields after every submission, fill ones included."""
         config, robot = self.config, self.config.robot.id
-        observation = self.driver.observe()
+        observation: Observation = self.env.reset()[1]["observation"]
         self.actor.begin(numbering.progress_of(self.counters, config.memory, robot), observation)
         while True:
             submission = self.actor.finish(observation)
@@ -69,8 +69,15 @@ class SingleProcess:
                 yield done
             action = self.actor.act(observation)
             assert action.action is not None
-            self.driver.execute(action.action)
-            observation = self.driver.observe()
+            observation = self._drive(action.action)
+
+    def _drive(self, action: int) -> Observation:
+        """Drive one action and look, after a bump from where the driver recovered to (E11)."""
+        _, _, bumped, _, info = self.env.step(np.int64(action))
+        if bumped:
+            _, info = self.env.reset()
+        observation: Observation = info["observation"]
+        return observation
 
     def _turn(self, episode: Episode) -> TurnDone:
         """Append -> discard -> equalise -> train or fit -> target rule -> publish (E25)."""

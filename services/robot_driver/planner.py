@@ -127,6 +127,7 @@ class Planner:
         self._room: Table = room.reshape(rows, columns).astype(np.float32)
         self._way = [self._way_room(action) for action in range(3)]
         self._margin = self._margin_table(horizon)
+        self._laps: dict[tuple[int, float], _Lap] = {}
 
     def drive(self, poses: Floats, actions: int) -> Run:
         """Planned runs that keep most room, from poses float64 [n, 3]."""
@@ -146,8 +147,10 @@ class Planner:
         Raises:
             ValueError: The world has no lap centre.
         """
-        lap = _Lap(direction, keep_m, self._lap_table(direction, keep_m))
-        return self._roll_out(pose[None, :], actions, lap)
+        key = direction, keep_m
+        if key not in self._laps:
+            self._laps[key] = _Lap(direction, keep_m, self._lap_table(direction, keep_m))
+        return self._roll_out(pose[None, :], actions, self._laps[key])
 
     def winding(self, poses: Floats) -> Floats:
         """Net angle round the lap centre along float64 [steps, 3], radians, float64 [steps].

@@ -3,29 +3,16 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from benchmarks import camera_quality, driving, run_all
+from benchmarks import camera_quality, run_all
 from benchmarks.camera_quality import CHECK
-from benchmarks.driving import Trace
-from services.robot_driver.robot import Pose
-from services.robot_driver.sim import SimRobot
-from services.robot_driver.world import load_world
-from shared.config import Config
-from shared.rl.policy import FORWARD_LEFT
 
 TINY = replace(CHECK, seeds=(1,), actions=20, starts=1, drive_actions=60)
-
-
-def trace(bumps: str, places_m: list[tuple[float, float]], laps: tuple[int, int]) -> Trace:
-    """A drive in which `x` is an action that bumps."""
-    return Trace(np.array([c == "x" for c in bumps]), np.array(places_m, np.float64), *laps)
 
 
 def test_last_line_of_the_script_is_its_bar(capsys: pytest.CaptureFixture[str]) -> None:
@@ -37,68 +24,6 @@ def test_last_line_of_the_script_is_its_bar(capsys: pytest.CaptureFixture[str]) 
     parts = ("bumps_per_1000", "least", "most", "distance", "laps", "nowhere")
     names = {f"{part}_{width}" for part in parts for width in (75, 150)}
     assert bars[0]["checks"].keys() == names | {"bumps_per_1000_random"}
-
-
-def test_figures_of_a_hand_made_drive() -> None:
-    straight = trace("..x.", [(0, 0), (1, 0), (2, 0), (3, 0), (4, 0)], (2, 0))
-    there_and_back = trace("....", [(0, 0), (0, 1), (0, 2), (0, 1), (0, 0)], (0, 1))
-    found = driving.figures([straight, there_and_back], horizon=2, max_distance_m=2.0)
-    assert found == {
-        "actions": 8,
-        "bumps": 1,
-        "bumps_per_1000": 125.0,
-        "mean_run": pytest.approx((2 + 1 + 4) / 3),
-        "longest_run": 4,
-        "distance": pytest.approx((2 + 2 + 2 + 2 + 0 + 2) / 6 / 2),
-        "laps_left": 2,
-        "laps_right": 1,
-    }
-
-
-@pytest.mark.parametrize(
-    ("bumps", "runs"),
-    [("...", [3]), ("x", [0]), ("xx.", [0, 0, 1]), (".x", [1]), (".x..x...", [1, 2, 3])],
-)
-def test_bump_free_runs(bumps: str, runs: list[int]) -> None:
-    assert driving.bump_free_runs(np.array([c == "x" for c in bumps])) == runs
-
-
-def test_a_circle_bumps_into_nothing_but_gets_nowhere() -> None:
-    config = Config()
-    robot = SimRobot(config.robot, load_world("plus"), 0)
-    start = Pose(4.2, 0.0, math.pi / 2.0)
-    driven = driving.drive(config, robot, lambda image, draw: FORWARD_LEFT, 0, start, 120)
-    robot.close()
-    found = driving.figures([driven], config.episode.horizon, config.max_distance_m)
-    assert (found["bumps"], found["longest_run"]) == (0, 120)
-    assert found["distance"] < 2 * 0.43 / config.max_distance_m
-    assert found["laps_left"] == found["laps_right"] == 0
-
-
-def test_starts_are_the_same_every_time_and_point_both_ways_along_the_corridor() -> None:
-    world = load_world("plus")
-    poses = driving.start_poses(world, 40)
-    assert poses == driving.start_poses(world, 40)
-    assert len(set(poses)) == 40
-    points = np.array([(pose.x_m, pose.y_m) for pose in poses])
-    assert (world.clearance(points) >= driving.ROOM_M).all()
-    ends = [pose for pose in poses if abs(pose.x_m) > 3.5 and abs(pose.y_m) < 1.0]
-    assert len(ends) > 3, "there must be starts where the corridor's direction is plain"
-    for pose in ends:
-        north = (pose.x_m > 0.0) == (poses.index(pose) % 2 == 0)
-        assert math.sin(pose.heading_rad) * (1.0 if north else -1.0) > 0.9
-
-
-def test_drives_depend_on_nothing_but_who_drives() -> None:
-    config = Config()
-    robots = [SimRobot(config.robot, load_world("plus"), 0) for _ in range(2)]
-    driving.drives(config, robots[1], driving.uniform, n=1, actions=30)
-    first, second = (driving.drives(config, r, driving.uniform, n=2, actions=40) for r in robots)
-    for robot in robots:
-        robot.close()
-    for a, b in zip(first, second, strict=True):
-        assert np.array_equal(a.places_m, b.places_m)
-        assert np.array_equal(a.bumps, b.bumps)
 
 
 def test_stored_runs_are_not_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,80 +7,17 @@ import importlib.util
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 from benchmarks import peer_learning, peer_transport, peers, run_all
-from benchmarks.corridor_env import CorridorEnv
 from experiments.provenance import ROOT
-from shared.config import Config
 
 SCRIPTS = ("peer_learning", "peer_replay", "peer_transport")
 CHUNK = peer_transport.CHUNK_BYTES
 KEPT = {"command": "python -m benchmarks.peer_replay", "bars": [], "error": ""}
-
-
-@pytest.fixture
-def env() -> Iterator[CorridorEnv]:
-    env = CorridorEnv(Config.model_validate({"episode": {"max_samples": 60}}))
-    yield env
-    env.close()
-
-
-def drive_to_bump(env: CorridorEnv, action: int = 0) -> tuple[list[float], Any]:
-    """Rewards of the same action until an episode is over, and the last step."""
-    rewards = []
-    while True:
-        step = env.step(np.int64(action))
-        rewards.append(float(step[1]))
-        if step[2] or step[3]:
-            return rewards, step
-
-
-# ---------------------------------------------------------------- the environment
-
-
-@pytest.mark.filterwarnings("ignore::UserWarning")  # it is not registered under a name
-def test_environment_keeps_the_rules_of_gymnasium(env: CorridorEnv) -> None:
-    check_env(env, skip_render_check=True)
-
-
-def test_a_bump_ends_an_episode_and_the_next_one_begins_after_backing_off(env: CorridorEnv) -> None:
-    env.reset(seed=1)
-    rewards, (image, reward, terminated, truncated, _) = drive_to_bump(env)
-    assert (reward, terminated, truncated) == (-1.0, True, False)
-    assert rewards[:-1] == pytest.approx([1.0] * (len(rewards) - 1))
-    assert env._robot.contact
-    assert env._driver.recoveries == 0
-    after, _ = env.reset()
-    assert env._driver.recoveries == 1
-    assert not env._robot.contact
-    assert not np.array_equal(image, after)
-
-
-def test_without_a_bump_an_episode_is_cut_off_and_goes_on_from_there() -> None:
-    env = CorridorEnv(Config.model_validate({"episode": {"max_samples": 3, "horizon": 2}}))
-    env.reset(seed=1)
-    rewards, (image, _, terminated, truncated, _) = drive_to_bump(env)
-    assert (len(rewards), terminated, truncated) == (3, False, True)
-    again, _ = env.reset()
-    assert np.array_equal(image, again)
-    env.close()
-
-
-def test_a_seed_puts_the_robot_back_to_the_start_and_repeats_everything(env: CorridorEnv) -> None:
-    runs = []
-    for _ in range(2):
-        first, _ = env.reset(seed=7)
-        rewards, (last, *_) = drive_to_bump(env)
-        after, _ = env.reset()
-        runs.append((first.tobytes(), rewards, last.tobytes(), after.tobytes()))
-    assert runs[0] == runs[1]
 
 
 # ---------------------------------------------------------------- work of our side
@@ -111,7 +48,7 @@ def test_weights_come_out_of_chunks_as_they_went_in(size: int) -> None:
 def test_peers_come_last_of_the_comparisons() -> None:
     found = run_all.scripts()
     assert [name for name in found if name in SCRIPTS] == list(SCRIPTS)
-    assert not {"peers", "peer_dqn", "peer_torchrl", "corridor_env"} & set(found)
+    assert not {"peers", "peer_dqn", "peer_torchrl"} & set(found)
 
 
 @pytest.mark.parametrize("name", SCRIPTS)

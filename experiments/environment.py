@@ -1,0 +1,185 @@
+"""The corridors as Gymnasium environments: `Corridor-Plus-v0` and one more for every world.
+
+Importing this module registers them; `gymnasium.make("experiments.environment:Corridor-Plus-v0")`
+does both at once. The single-process loop and all evaluation run on the same class.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from gymnasium.error import InvalidAction, ResetNeeded
+
+from services.robot_driver.driver import Driver
+from services.robot_driver.robot import Pose
+from services.robot_driver.sim import SimRobot
+from services.robot_driver.world import WORLDS, World, load_world
+from shared.config import Config
+from shared.messages import Observation, image_array
+from shared.rl.policy import ACTIONS
+from shared.rl.preprocess import HEIGHT, WIDTH
+
+LIFE = "0" * 12
+"""Life ids are random in the services; comparison ignores them."""
+MAX_EPISODE_STEPS = 500
+"""Of the registered environments: as long as an episode can be (A9)."""
+PICTURE_PX = 480, 270
+"""Width and height of a rendered picture."""
+Image = npt.NDArray[np.uint8]
+Info = dict[str, Any]
+
+
+class CorridorEnv(gymnasium.Env[Image, np.int64]):
+    """One simulated robot behind its driver.
+
+    Observation: the grey image, uint8 [50, 75, 1]. Action: 0 forward, 1 forward/left, 2
+    forward/right (A21). Reward: the part of the longest possible way that the robot got on, -1 at a
+    bump. A bump ends an episode; how many actions end one without a bump is for a wrapper to say,
+    and the registered environments have one.
+
+    The next episode begins where the last one ended (A8), after the driver has recovered from the
+    bump (E11). With a seed it begins at the first start pose instead, with recoveries drawn anew
+    from that seed; option `pose` (a `Pose`) names another place.
+
+    At a bump no picture is taken: `step` gives the image the robot acted on once more, because what
+    is seen in contact is never acted from (E6). Otherwise `info["observation"]` is the driver's
+    `Observation`, with pose, laps, world and bump.
+
+    Args:
+        world: Name of the world; default: the configured one.
+        config: Robot, episode and seed.
+        robot: An existing robot to drive instead of a new one, from where it is and among the
+            obstacles that stand there: this is where a seed puts it back to.
+        render_mode: `rgb_array`: `render` gives what the camera sees, in colour.
+
+    Raises:
+        ValueError: Another render mode.
+        WorldError: No such world.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012
+
+    def __init__(
+        self,
+        world: str | None = None,
+        *,
+        config: Config | None = None,
+        robot: SimRobot | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode: expected None or 'rgb_array', got {render_mode!r}")
+        self.config = with_world(config or Config(), world)
+        chosen = self.config.robot
+        self.robot = robot or SimRobot(chosen, load_world(chosen.world), self.config.run.seed)
+        self.driver = Driver(self.config, self.robot, LIFE)
+        """Replaced when `reset` is given a seed."""
+        self.render_mode = render_mode
+        self.observation_space = spaces.Box(0, 255, (HEIGHT, WIDTH, 1), np.uint8)
+        self.action_space = spaces.Discrete(ACTIONS)
+        self._start = self.robot.state()
+        self._longest_m = chosen.speed_m_s * chosen.period_s
+        self._seen: Observation | None = None
+        self._bumped = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Image, Info]:
+        """Begin an episode. Raises ValueError for a pose inside a wall or without a seed."""
+        super().reset(seed=seed, options=options)
+        pose: Pose | None = (options or {}).get("pose")
+        if seed is not None:
+            self._restart(seed, pose)
+        elif pose is not None:
+            raise ValueError("reset: the option 'pose' needs a seed, for the recoveries to come")
+        elif self._bumped:
+            self.driver.settle(True)
+        self._bumped = False
+        return self._result(self.observe())
+
+    def step(self, action: np.int64) -> tuple[Image, float, bool, bool, Info]:
+        """Drive one action and look, unless it ended in a bump.
+
+        Raises:
+            InvalidAction: Not 0, 1 or 2.
+            ResetNeeded: There was no `reset` yet, or none since the bump.
+        """
+        if not self.action_space.contains(action):
+            raise InvalidAction(f"expected an action 0..{ACTIONS - 1}, got {action!r}")
+        before = self._seen
+        if before is None or self._bumped:
+            raise ResetNeeded("call reset() at first and after a bump")
+        self.driver.start(int(action))
+        self._bumped = self.driver.advance(self.config.robot.period_s)
+        if self._bumped:
+            return _pixels(before), -1.0, True, False, {}
+        self.driver.settle(False)
+        after = self.observe()
+        way_m = math.hypot(after.x_m - before.x_m, after.y_m - before.y_m)
+        image, info = self._result(after)
+        return image, way_m / self._longest_m, False, False, info
+
+    @property
+    def world(self) -> World:
+        """The world the robot is in, with the obstacles that stand there now."""
+        return self.robot.world.model_copy(update={"obstacles": self.robot.obstacles})
+
+    def observe(self) -> Observation:
+        """Sense now, as after a change of the world that was no action."""
+        self._seen = self.driver.observe()
+        return self._seen
+
+    def render(self) -> Image | None:
+        """What the camera sees, uint8 [270, 480, 3] RGB; None without the render mode."""
+        return self.robot.frame(*PICTURE_PX) if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Free the simulation. May be called twice."""
+        self.robot.close()
+
+    def _result(self, observation: Observation) -> tuple[Image, Info]:
+        return _pixels(observation), {"observation": observation}
+
+    def _restart(self, seed: int, pose: Pose | None) -> None:
+        """Put the robot to where it began, or stand it somewhere with time and laps at zero."""
+        state = self._start
+        if pose is not None:
+            state = {key: v if isinstance(v, str) else 0 for key, v in state.items()}
+            state |= {"x_m": pose.x_m, "y_m": pose.y_m, "heading_rad": pose.heading_rad}
+        self.robot.restore(state)
+        run = self.config.run.model_copy(update={"seed": seed})
+        self.driver = Driver(self.config.model_copy(update={"run": run}), self.robot, LIFE)
+
+
+def with_world(config: Config, world: str | None) -> Config:
+    """The configuration with another world, if one is named."""
+    if world is None:
+        return config
+    return config.model_copy(update={"robot": config.robot.model_copy(update={"world": world})})
+
+
+def env_id(world: str) -> str:
+    """The id a world's environment is registered under."""
+    return f"Corridor-{world.capitalize()}-v0"
+
+
+def _pixels(observation: Observation) -> Image:
+    return image_array(observation.image)[:, :, np.newaxis]
+
+
+def _register() -> None:
+    for path in sorted(WORLDS.glob("*.toml")):
+        gymnasium.register(
+            id=env_id(path.stem),
+            entry_point="experiments.environment:CorridorEnv",
+            max_episode_steps=MAX_EPISODE_STEPS,
+            kwargs={"world": path.stem},
+        )
+
+
+_register()
