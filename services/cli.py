@@ -270,6 +270,28 @@ def world_check(
         typer.echo(f"{key:40} {value:.3f}" if isinstance(value, float) else f"{key:40} {value}")
 
 
+# ---------------------------------------------------------------- experiments
+
+
+@app.command()
+def report(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUNS...", help="Folders of seeds, of experiments, or of several experiments."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the pages.")] = Path("report"),
+    gpu_step_ms: Annotated[
+        float | None,
+        typer.Option(help="Measured time of a GPU's gradient step; adds projected hours.", min=0),
+    ] = None,
+) -> None:
+    """Write figures, tables and findings of finished runs as HTML and Markdown."""
+    pages = import_role("experiments.report", "experiments").write(runs, out, gpu_step_ms)
+    typer.echo(f"written: {pages[0]} and {len(pages) - 1} Markdown pages beside it")
+
+
 # ---------------------------------------------------------------- shared by the commands
 
 
@@ -321,7 +343,7 @@ def import_role(module: str, role: str) -> Any:
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] in {"services", "shared"}:
+        if (error.name or "").split(".")[0] in {"experiments", "services", "shared"}:
             raise
         extra = "sim" if role == "driver" else role
         raise ConfigError(

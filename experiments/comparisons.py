@@ -1,0 +1,195 @@
+"""Figures and tables of several experiments together, scale by scale."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from experiments import findings
+from experiments.document import Block, Findings, Missing, Picture, Section, Table
+from experiments.figures import evaluation, probes, progress
+from experiments.figures.style import png
+from experiments.measures import Kept, compare, kept, max_mean_fitness, number, of_seeds, spread
+from experiments.runs import Experiment
+
+POLICY = "policy-"
+"""Experiments whose name begins so are rows of the table of policies (Fig 4.2)."""
+PROBES_SHOWN = 6
+EXPECTED_BEST_FIRST = {
+    name: rank
+    for rank, name in enumerate(("plus-rmm", "plus-rmm-nopretrain", "plus-normm-fit", "plus-normm"))
+}
+Named = dict[str, Experiment]
+
+
+def compare_all(experiments: Sequence[Experiment]) -> list[Section]:
+    """One section per scale at which at least two experiments were given."""
+    sections = []
+    for scale in sorted({experiment.scale for experiment in experiments}):
+        named = {e.name: e for e in experiments if e.scale == scale}
+        if len(named) > 1:
+            blocks = (
+                *_policies(named),
+                *_continued(named),
+                *_fitted(named),
+                *_frozen(named),
+                *_predictions(named, "plus-rmm", "best", "plus-normm", "best", "4.10"),
+                *_predictions(named, "plus-minus", "end", "plus-rmm", "best", "4.16"),
+                *_kept(named),
+            )
+            sections.append(Section(f"comparisons-{scale}", f"Comparisons, {scale} scale", blocks))
+    return sections
+
+
+def _missing(what: str, named: Named, needed: Sequence[str]) -> list[Block]:
+    absent = [name for name in needed if name not in named]
+    return [Missing(what, f"no runs of {', '.join(absent)} at this scale were given")]
+
+
+def _policies(named: Named) -> list[Block]:
+    shown = [e for name, e in named.items() if name.startswith(POLICY)]
+    if not shown:
+        return []
+    rows = tuple(
+        (
+            e.first.title,
+            str(e.first.episodes),
+            str(e.first.thesis.get("max_mean_fitness", "-")),
+            spread(of_seeds(e, max_mean_fitness)),
+            str(len(e.runs)),
+        )
+        for e in shown
+    )
+    window = shown[0].runs[0].window
+    title = f"Action policies (Fig 4.2): highest mean fitness of {window} episodes"
+    header = ("policy", "episodes", "thesis (100 episodes)", "ours, median and span", "seeds")
+    return [Table(title, header, rows), *_sentences(findings.policies(shown))]
+
+
+def _sentences(sentences: Sequence[str]) -> list[Block]:
+    return [Findings(tuple(sentences))] if sentences else []
+
+
+def _continued(named: Named) -> list[Block]:
+    what = "NoRMM going on with fitting phases (Fig 4.5)"
+    needed = ("plus-normm", "plus-normm-fit")
+    if blocks := _absent(what, named, needed):
+        return blocks
+    before, after = (named[name] for name in needed)
+    caption = "Fitness. Red line: where fitting phases and five mini-batches per episode begin."
+    drawn = progress.continued(before, after)
+    picture = Picture(f"{before.scale}-fits", what, caption, png(drawn))
+    return [picture, *_sentences(findings.continued(before, after))]
+
+
+def _absent(what: str, named: Named, needed: Sequence[str]) -> list[Block]:
+    """Why a figure cannot be drawn; empty if it can."""
+    if not all(name in named for name in needed):
+        return _missing(what, named, needed)
+    for name in needed:
+        for run in named[name].runs:
+            if len(run.episodes) < run.window:
+                return [Missing(what, f"{name}, seed {run.info.seed}: too few episodes yet")]
+    return []
+
+
+def _fitted(named: Named) -> list[Block]:
+    what = "RMM with and without pre-training, and NoRMM with fits (Fig 4.12)"
+    needed = ("plus-rmm", "plus-rmm-nopretrain", "plus-normm-fit")
+    if blocks := _absent(what, named, needed):
+        return blocks
+    shown = [named[name] for name in needed]
+    caption = "Fitness; bands: lowest to highest seed. Episodes are counted as in every run."
+    picture = Picture(f"{shown[0].scale}-rmm", what, caption, png(progress.compared(shown)))
+    return [picture, *_sentences(findings.fitted(shown[:2], shown[2]))]
+
+
+def _frozen(named: Named) -> list[Block]:
+    """Frozen drives of comparable experiments together, and differences of all their pairs."""
+    blocks: list[Block] = []
+    for group, shown in _comparable(named).items():
+        blocks += _together(group, shown)
+    return blocks
+
+
+def _comparable(named: Named) -> dict[str, list[Experiment]]:
+    """Experiments that learned the same corridors, policies apart; alone ones left out."""
+    groups: dict[str, list[Experiment]] = {}
+    for name, experiment in sorted(named.items(), key=_rank):
+        worlds = sorted({stage.world for stage in experiment.first.stages})
+        kind = "policies" if name.startswith(POLICY) else "runs"
+        groups.setdefault("-".join([kind, *worlds]), []).append(experiment)
+    return {group: shown for group, shown in groups.items() if len(shown) > 1}
+
+
+def _rank(item: tuple[str, Experiment]) -> tuple[int, str]:
+    """RMM before NoRMM, so that a negative difference means that RMM bumped less."""
+    return (EXPECTED_BEST_FIRST.get(item[0], len(EXPECTED_BEST_FIRST)), item[0])
+
+
+def _together(group: str, shown: Sequence[Experiment]) -> list[Block]:
+    scale = shown[0].scale
+    blocks: list[Block] = []
+    for world in sorted(set.intersection(*(set(e.worlds) for e in shown))):
+        caption = "Greedy drives without learning; bands: lowest to highest seed."
+        drawn = evaluation.curves(shown, world)
+        title = f"Frozen evaluation in {world}, {', '.join(e.name for e in shown)}"
+        name = f"{scale}-evaluation-{group}-in-{world}"
+        blocks.append(Picture(name, title, caption, png(drawn)))
+    pairs, refused = compare(shown)
+    if pairs:
+        caption = (
+            "Difference of mean bumps per 1,000 actions of the newest frozen drives; bootstrap "
+            "over seeds, 95 % interval. Filled: it excludes 0. With few seeds it is rough."
+        )
+        drawn = evaluation.differences(pairs)
+        name = f"{scale}-differences-{group}"
+        blocks.append(Picture(name, "Differences between experiments", caption, png(drawn)))
+        blocks.append(Findings(tuple(findings.difference(pair) for pair in pairs)))
+    return [*blocks, *(Missing("difference of bumps", line) for line in refused)]
+
+
+def _predictions(
+    named: Named, ours: str, our_weights: str, theirs: str, their_weights: str, figure: str
+) -> list[Block]:
+    """Two networks on the same images of Plus, the lowest seeds (Fig 4.10, 4.16)."""
+    what = f"Predicted rewards in plus, {ours} and {theirs} (Fig {figure})"
+    if not (ours in named and theirs in named):
+        return _missing(what, named, (ours, theirs))
+    first = probes.choose(named[ours], "plus", our_weights)
+    second = probes.choose(named[theirs], "plus", their_weights)
+    if first is None or second is None:
+        absent = ours if first is None else theirs
+        return [Missing(what, f"{absent} has no probes of Plus with these weights")]
+    if not probes.same_images(first.probes, second.probes):
+        return [Missing(what, "the two were asked about different images")]
+    networks = [
+        probes.Predictions(ours, first.probes.values),
+        probes.Predictions(theirs, second.probes.values),
+    ]
+    caption = (
+        f"Upper bars: {our_weights} weights of {ours}, seed {first.seed}; lower bars: "
+        f"{their_weights} weights of {theirs}, seed {second.seed}. From −1 to 1."
+    )
+    drawn = probes.predictions(first.probes, networks, PROBES_SHOWN)
+    return [Picture(f"{named[ours].scale}-probes-{ours}-{theirs}", what, caption, png(drawn))]
+
+
+def _kept(named: Named) -> list[Block]:
+    """What Plus-Minus kept of Plus."""
+    if "plus-minus" not in named:
+        return []
+    starts = {run.info.seed: run for run in named["plus-rmm"].runs} if "plus-rmm" in named else {}
+    found: list[Kept] = []
+    for run in named["plus-minus"].runs:
+        entry = kept(run, "plus", starts.get(run.info.seed))
+        if entry is not None:
+            found.append(entry)
+    title = "Kept of Plus: actions between bumps in frozen drives before and after Minus"
+    if not found:
+        return [Missing(title, "no seed drove frozen in Plus before and after the Minus stage")]
+    rows = tuple(
+        (str(entry.seed), number(entry.before), number(entry.after), f"{100 * entry.share:.0f} %")
+        for entry in found
+    )
+    header = ("seed", "before Minus", "after Minus", "kept")
+    return [Table(title, header, rows), Findings(tuple(findings.kept_share(found, "Plus")))]

@@ -1,0 +1,1 @@
+"""Figures of runs, one file per kind; every function returns a matplotlib figure, unwritten."""

@@ -1,0 +1,165 @@
+"""Single numbers of runs, how they are written, and comparisons of seeds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from experiments.figures.evaluation import Compared, laps
+from experiments.figures.progress import curve_of
+from experiments.runs import Experiment, Floats, Rows, Run
+from experiments.statistics import bootstrap_difference
+from shared.rl.draws import generator
+
+MISSING = float("nan")
+BOOTSTRAP_SEED = 0
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A number of a run that the thesis tells as well."""
+
+    text: str
+    of: Callable[[Run], float]
+    scales: bool
+    """Whether it grows with the number of episodes or samples of a run."""
+
+
+def _highest(run: Run, column: str) -> float:
+    values = run.episodes.numbers(column)
+    return float(np.nanmax(values)) if np.any(~np.isnan(values)) else MISSING
+
+
+def max_mean_fitness(run: Run) -> float:
+    """Highest point of the fitness curve (A38)."""
+    return float(np.max(curve_of(run, "fitness")[1], initial=-math.inf))
+
+
+def actions_per_episode(run: Run) -> float:
+    """Mean of all episodes."""
+    return run.info.actions / run.info.episodes if run.info.episodes else MISSING
+
+
+MEASURED = {
+    "episodes": Measure("episodes", lambda run: float(run.info.episodes), scales=True),
+    "actions": Measure("actions", lambda run: float(run.info.actions), scales=True),
+    "actions_per_episode": Measure("actions per episode", actions_per_episode, scales=False),
+    "capacity": Measure(
+        "largest capacity of the memory", lambda run: _highest(run, "capacity"), scales=True
+    ),
+    "longest_run": Measure(
+        "most actions without a bump", lambda run: _highest(run, "longest_run_actions"), scales=True
+    ),
+    "max_mean_fitness": Measure("highest mean fitness", max_mean_fitness, scales=False),
+    "max_threshold_percent": Measure(
+        "highest threshold (%)", lambda run: _highest(run, "threshold_percent"), scales=False
+    ),
+}
+"""What stands in `thesis` of run.json under these names is shown beside ours (E37)."""
+
+
+def of_seeds(experiment: Experiment, measure: Callable[[Run], float]) -> Floats:
+    """One number per seed, float64 [seeds], without those that have none."""
+    values = np.array([measure(run) for run in experiment.runs], np.float64)
+    return values[np.isfinite(values)]
+
+
+def newest(run: Run, world: str, driver: str = "network") -> Rows:
+    """The last drive of a driver in a world, one row or none."""
+    return Rows(run.evaluations.where(driver=driver, world=world).rows[-1:])
+
+
+def evaluated(column: str, world: str, driver: str = "network") -> Callable[[Run], float]:
+    """A figure of the newest drive; `laps` counts both directions."""
+
+    def measure(run: Run) -> float:
+        rows = newest(run, world, driver)
+        values = laps(rows) if column == "laps" else rows.numbers(column)
+        return float(values[0]) if len(values) else MISSING
+
+    return measure
+
+
+def compare(experiments: Sequence[Experiment]) -> tuple[list[Compared], list[str]]:
+    """Differences of bumps between all pairs that drove in the same world.
+
+    Returns:
+        The differences, and one line for every pair with too few seeds to compare.
+    """
+    pairs, refused = [], []
+    for i, ours in enumerate(experiments):
+        for theirs in experiments[i + 1 :]:
+            for world in sorted({*ours.worlds} & {*theirs.worlds}):
+                bumps = evaluated("bumps_per_1000", world)
+                a, b = of_seeds(ours, bumps), of_seeds(theirs, bumps)
+                draw = generator(BOOTSTRAP_SEED, "bootstrap", ours.name, theirs.name, world)
+                if min(len(a), len(b)) < 2:
+                    names = f"{ours.name} and {theirs.name} in {world}"
+                    refused.append(f"{names}: {len(a)} and {len(b)} seeds, at least 2 each needed")
+                    continue
+                difference = bootstrap_difference(a, b, draw)
+                pairs.append(Compared(ours.name, theirs.name, world, (len(a), len(b)), difference))
+    return pairs, refused
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Mean bump-free run in a world before and after learning another one."""
+
+    seed: int
+    before: float
+    after: float
+
+    @property
+    def share(self) -> float:
+        """What is left of it."""
+        return self.after / self.before if self.before else MISSING
+
+
+def kept(run: Run, world: str, start: Run | None) -> Kept | None:
+    """How much of one world is left after the stages in others that a run begins with.
+
+    Args:
+        run: Begins in another world.
+        world: The one it could drive in before.
+        start: The run it goes on from, looked at if `run` did not drive before its first episode.
+
+    Returns:
+        None where one of the two drives is missing.
+    """
+    stages = run.info.stages
+    away = [stage for stage in stages if stage.world != world]
+    if not away or stages[0].world == world:
+        return None
+    first, last = stages[0].first_episode, away[-1].last_episode
+    rows = run.evaluated(world)
+    episodes, means = rows.numbers("episode"), rows.numbers("mean_run")
+    before = means[episodes < first]
+    if not len(before) and start is not None:
+        before = newest(start, world).numbers("mean_run")
+    after = means[(episodes >= first) & (episodes <= last)]
+    if not len(before) or not len(after):
+        return None
+    return Kept(run.info.seed, float(before[-1]), float(after[-1]))
+
+
+def number(value: float) -> str:
+    """Three digits that count, thousands apart; a dash for none."""
+    if not math.isfinite(value):
+        return "-"
+    if abs(value) >= 100 or value == round(value):
+        return f"{value:,.0f}".replace("-", "−")
+    return f"{value:.3g}".replace("-", "−")
+
+
+def spread(values: Floats) -> str:
+    """Median, and lowest to highest of several seeds."""
+    if not len(values):
+        return "-"
+    middle = number(float(np.median(values)))
+    if len(values) == 1:
+        return middle
+    return f"{middle} ({number(float(values.min()))} to {number(float(values.max()))})"

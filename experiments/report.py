@@ -1,0 +1,289 @@
+"""The report of runs: every figure of the thesis in our form, and what it does not show.
+
+One HTML page that needs no other file, one Markdown page per experiment and one per scale with
+the comparisons. A figure whose data are not there is left out with a line saying so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from experiments import findings, runs
+from experiments.comparisons import compare_all
+from experiments.document import (
+    Block,
+    Findings,
+    Missing,
+    Picture,
+    Section,
+    Table,
+    html,
+    markdown,
+    write_pictures,
+)
+from experiments.figures import evaluation, memory, probes, progress, route
+from experiments.figures.style import png, stages_text
+from experiments.measures import MEASURED, evaluated, number, of_seeds, spread
+from experiments.runs import Experiment, Run
+from services.robot_driver.world import World, WorldError, load_world
+from shared.errors import StateError
+
+TITLE = "Results"
+PROBES_SHOWN = 12
+MS_PER_H = 3.6e6
+EVALUATED = ("bumps_per_1000", "laps", "distance")
+"""Of the newest frozen drive, in the table of all runs."""
+THESIS_FIGURES = {
+    ("plus-normm", "fitness"): "Fig 4.4a",
+    ("plus-normm", "loss"): "Fig 4.4b",
+    ("plus-normm", "memory"): "Fig 4.6",
+    ("plus-normm", "probes-best"): "Fig 4.7",
+    ("plus-rmm", "fitness"): "Fig 4.9a",
+    ("plus-rmm", "loss"): "Fig 4.9b",
+    ("plus-rmm", "memory"): "Fig 4.11",
+    ("plus-minus", "fitness"): "Fig 4.14",
+    ("plus-minus", "worlds"): "Fig 4.15",
+    ("plus-minus", "probes-end-minus"): "Fig 4.17",
+    ("i16c", "probes-end-i16c"): "Fig 4.19",
+    ("i16c-test", "route"): "Fig 4.20",
+}
+"""Which of our figures stands for which of the thesis."""
+
+
+def write(folders: Sequence[Path], out: Path, gpu_step_ms: float | None = None) -> list[Path]:
+    """Read runs and write the whole report.
+
+    Args:
+        folders: Of seeds, of experiments, or of several experiments.
+        out: Where to, made if missing.
+        gpu_step_ms: Measured time of a gradient step on a GPU; adds projected hours.
+
+    Returns:
+        The pages written, HTML first.
+
+    Raises:
+        ConfigError: A folder holds no run.
+        StateError: A file of a run is damaged.
+    """
+    experiments = runs.load(folders)
+    overview = Section("runs", "All runs", overview_blocks(experiments, gpu_step_ms))
+    parts = [section_of(experiment) for experiment in experiments]
+    compared = compare_all(experiments)
+    write_pictures([*parts, *compared], out / "figures")
+    page = out / "report.html"
+    page.write_text(html(TITLE, [overview, *parts, *compared]), encoding="utf-8")
+    written = [page]
+    for section in [overview, *parts, *compared]:
+        path = out / f"{section.name}.md"
+        path.write_text(markdown([section], "figures", level=1), encoding="utf-8")
+        written.append(path)
+    return written
+
+
+def overview_blocks(
+    experiments: Sequence[Experiment], gpu_step_ms: float | None = None
+) -> tuple[Block, ...]:
+    """Everything that was run, and what it cost."""
+    everything = Table(
+        "Everything run; evaluations are the newest of the frozen network",
+        ("experiment", "scale", "seed", "complete", "seconds", "actions", "episodes",
+         "gradient steps", "evaluated in: bumps, laps per 1,000 actions, distance",
+         "command", "machine", "commit"),
+        tuple(_run_row(run) for experiment in experiments for run in experiment.runs),
+    )  # fmt: skip
+    return (everything, _costs(experiments, gpu_step_ms))
+
+
+def _run_row(run: Run) -> tuple[str, ...]:
+    info = run.info
+    worlds = dict.fromkeys(run.evaluations.where(driver="network").words("world"))
+    told = (
+        f"{world}: "
+        + ", ".join(
+            number(evaluated(c, world)(run)) for c in ("bumps_per_1000", "laps", "distance")
+        )
+        for world in worlds
+    )
+    return (
+        info.experiment, info.scale, str(info.seed), "yes" if info.complete else "no",
+        f"{info.seconds:,.0f}", f"{info.actions:,}", f"{info.episodes:,}", f"{info.train_steps:,}",
+        "; ".join(told) or "-", f"`{info.command}`", info.machine, f"`{info.commit}`",
+    )  # fmt: skip
+
+
+def _costs(experiments: Sequence[Experiment], gpu_step_ms: float | None) -> Table:
+    header = ["experiment", "seeds", "actions", "gradient steps", "hours"]
+    if gpu_step_ms is not None:
+        header.append(f"projected hours of gradient steps on a GPU, {gpu_step_ms:g} ms each")
+    rows = []
+    for experiment in experiments:
+        infos = [run.info for run in experiment.runs]
+        steps = sum(info.train_steps for info in infos)
+        row = [
+            experiment.full_name,
+            str(len(infos)),
+            f"{sum(info.actions for info in infos):,}",
+            f"{steps:,}",
+            f"{sum(info.seconds for info in infos) / 3600:.2f}",
+        ]
+        if gpu_step_ms is not None:
+            row.append(f"{steps * gpu_step_ms / MS_PER_H:.2f}")
+        rows.append(tuple(row))
+    return Table("Cost, all seeds together", tuple(header), tuple(rows))
+
+
+def section_of(experiment: Experiment) -> Section:
+    """Figures, tables and sentences of one experiment."""
+    blocks: list[Block] = [Findings(tuple(findings.completeness(experiment)))]
+    blocks += _beside_thesis(experiment)
+    blocks += _progress(experiment)
+    blocks += _memory(experiment)
+    blocks += _evaluations(experiment)
+    blocks += _probes(experiment)
+    blocks += _routes(experiment)
+    title = f"{experiment.first.title} ({experiment.full_name})"
+    return Section(experiment.full_name, title, tuple(blocks))
+
+
+def _picture(experiment: Experiment, kind: str, title: str, caption: str, drawn: Figure) -> Picture:
+    theirs = THESIS_FIGURES.get((experiment.name, kind))
+    shown = f"{title} ({theirs})" if theirs else title
+    return Picture(f"{experiment.full_name}-{kind}", shown, caption, png(drawn))
+
+
+def _seeds_text(experiment: Experiment) -> str:
+    count = len(experiment.runs)
+    return "One seed." if count == 1 else f"{count} seeds: median, lowest to highest."
+
+
+def _beside_thesis(experiment: Experiment) -> list[Block]:
+    thesis, factor = experiment.first.thesis, experiment.first.factor
+    if not thesis:
+        return [Missing("the thesis's numbers", "the thesis tells none for this experiment")]
+    rows = []
+    for name, value in thesis.items():
+        measure = MEASURED.get(name)
+        if measure is None or not isinstance(value, int | float):
+            rows.append((name.replace("_", " "), str(value), "-", "not measured"))
+            continue
+        scaled = number(value / factor) if measure.scales else number(value)
+        rows.append((measure.text, number(value), scaled, spread(of_seeds(experiment, measure.of))))
+    header = ("", "thesis", f"thesis at this scale (1/{factor:g})", "ours")
+    title = "Beside the thesis, whose numbers are those of single runs: shapes count, not digits"
+    return [Table(title, header, tuple(rows))]
+
+
+def _progress(experiment: Experiment) -> list[Block]:
+    window = experiment.runs[0].window
+    short = [run for run in experiment.runs if len(run.episodes) < window]
+    if len(short) == len(experiment.runs):
+        why = f"fewer than {window} episodes in every seed"
+        return [Missing("fitness and loss over episodes", why)]
+    stages = stages_text(experiment.first.stages)
+    about = f"Fitness, averaged over {window} episodes; green: episodes that reached 500."
+    if window != runs.WINDOW:
+        about += f" The thesis averages {runs.WINDOW}; this run is 1/{experiment.first.factor:g}."
+    caption = f"{about} {_seeds_text(experiment)} {stages}"
+    drawn = progress.fitness(experiment)
+    blocks: list[Block] = [_picture(experiment, "fitness", "Fitness", caption, drawn)]
+    blocks.append(Findings(tuple(findings.fitness(experiment))))
+    if not any(len(progress.curve_of(run, "loss")[0]) for run in experiment.runs):
+        return [*blocks, Missing("loss over episodes", "nothing was trained")]
+    caption = f"Loss, averaged over {window} episodes. {_seeds_text(experiment)} {stages}"
+    blocks.append(_picture(experiment, "loss", "Loss", caption, progress.loss(experiment)))
+    return [*blocks, *_sentences(findings.loss(experiment))]
+
+
+def _sentences(sentences: Sequence[str]) -> list[Block]:
+    return [Findings(tuple(sentences))] if sentences else []
+
+
+def _memory(experiment: Experiment) -> list[Block]:
+    if not all(len(run.episodes) for run in experiment.runs):
+        return [Missing("samples in the memory", "a seed has no episodes yet")]
+    drawn = memory.by_action(experiment)
+    caption = f"Samples in the replay memory by action. {_seeds_text(experiment)}"
+    blocks: list[Block] = [_picture(experiment, "memory", "Memory by action", caption, drawn)]
+    blocks += _sentences(findings.memory(experiment))
+    several = any(len(run.samples_by_world) > 1 for run in experiment.runs)
+    if several:
+        caption = f"Samples in the replay memory by corridor. {_seeds_text(experiment)}"
+        drawn = memory.by_world(experiment)
+        blocks.append(_picture(experiment, "worlds", "Memory by corridor", caption, drawn))
+        blocks += _sentences(findings.worlds_in_memory(experiment))
+    elif (experiment.name, "worlds") in THESIS_FIGURES:
+        blocks.append(Missing("memory by corridor (Fig 4.15)", "samples of one corridor only"))
+    return blocks
+
+
+def _evaluations(experiment: Experiment) -> list[Block]:
+    if not experiment.worlds:
+        return [Missing("drives of the frozen network", "there are none in evaluations.csv")]
+    blocks: list[Block] = []
+    for world in experiment.worlds:
+        caption = (
+            f"Greedy drives of the frozen network in {world}, without learning. "
+            f"{_seeds_text(experiment)} Lines across: random actions and the planner that knows "
+            "the map, where they drove."
+        )
+        title = f"Frozen evaluation in {world}"
+        drawn = evaluation.curves([experiment], world)
+        blocks.append(_picture(experiment, f"evaluation-{world}", title, caption, drawn))
+        blocks += _sentences(findings.evaluation(experiment, world))
+    return blocks
+
+
+def _probes(experiment: Experiment) -> list[Block]:
+    """What the best and the last weights of the lowest seed predict, one figure per corridor."""
+    found = {
+        (prefix, probe.world): probes.choose(experiment, probe.world, prefix)
+        for run in experiment.runs
+        for probe in run.probes
+        for prefix in ("best", "end")
+    }
+    blocks: list[Block] = []
+    for (prefix, world), choice in sorted(found.items()):
+        if choice is None:
+            continue
+        weights = "best" if prefix == "best" else "last"
+        drawn = probes.predictions(
+            choice.probes, [probes.Predictions("reward", choice.probes.values)], PROBES_SHOWN
+        )
+        caption = (
+            f"Images of the set {choice.probes.set_name}, and the rewards that the {weights} "
+            f"weights of seed {choice.seed} predict for left, forward and right, from −1 to 1."
+        )
+        title = f"Predicted rewards in {world}, {weights} weights"
+        kind = f"probes-{prefix}-{world}"
+        if (experiment.name, f"probes-{prefix}") in THESIS_FIGURES:
+            title += f" ({THESIS_FIGURES[experiment.name, f'probes-{prefix}']})"
+        blocks.append(_picture(experiment, kind, title, caption, drawn))
+    return blocks or [Missing("predicted rewards", "there is no probes-best or probes-end file")]
+
+
+def _routes(experiment: Experiment) -> list[Block]:
+    blocks: list[Block] = []
+    for run in experiment.runs:
+        for drive in run.routes:
+            events = "; ".join(f"{e.number} (action {e.action}) {e.text}" for e in drive.events)
+            seed = f"Drive {drive.label} of seed {run.info.seed} in {drive.world}."
+            caption = f"{seed} Numbers: {events}." if events else seed
+            title = f"Route in {drive.world}"
+            if theirs := THESIS_FIGURES.get((experiment.name, "route")):
+                title += f" ({theirs})"
+            drawn = route.route(drive, _world(drive.world, run.folder))
+            kind = f"route-{drive.label}-{run.info.seed}"
+            blocks.append(_picture(experiment, kind, title, caption, drawn))
+    if not blocks and (experiment.name, "route") in THESIS_FIGURES:
+        return [Missing("route (Fig 4.20)", "there is no route file")]
+    return blocks
+
+
+def _world(name: str, folder: Path) -> World:
+    try:
+        return load_world(name)
+    except WorldError as error:
+        raise StateError(f"{folder}: a route is in a world that is not there: {error}") from error

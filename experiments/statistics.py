@@ -1,0 +1,126 @@
+"""Figures of curves and seeds: pure functions of arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Curve = tuple[Floats, Floats]
+"""Ascending places and the values there, float64 [n] each."""
+
+RESAMPLES = 10_000
+LEVEL = 0.95
+
+
+@dataclass(frozen=True)
+class Band:
+    """Seeds together: lowest, middle and highest value at every place."""
+
+    x: Floats
+    low: Floats
+    median: Floats
+    high: Floats
+    seeds: int
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Difference of two means, with an interval."""
+
+    mean: float
+    low: float
+    high: float
+
+    @property
+    def sure(self) -> bool:
+        """Whether the interval excludes 0."""
+        return self.low > 0.0 or self.high < 0.0
+
+
+def block_means(episodes: Floats, values: Floats, size: int) -> Curve:
+    """Means of every `size` episodes, as the thesis draws its curves (A37).
+
+    A block that is not full is left out, as is one without any value (NaN).
+
+    Args:
+        episodes: Ascending episode numbers, float64 [n].
+        values: One per episode, NaN for none, float64 [n].
+        size: Episodes of a block.
+
+    Returns:
+        Number of the last episode of each block, and its mean.
+    """
+    full = len(values) // size
+    cut = values[: full * size].reshape(full, size)
+    there = ~np.isnan(cut)
+    count = there.sum(axis=1)
+    some = count > 0
+    sums = np.where(there, cut, 0.0).sum(axis=1)
+    return episodes[size - 1 : full * size : size][some], sums[some] / count[some]
+
+
+def band_of_blocks(curves: Sequence[Curve]) -> Band:
+    """Seeds whose curves have values at the same places; a place counts where any seed has it."""
+    x = np.unique(np.concatenate([places for places, _ in curves]))
+    values = np.full((len(curves), len(x)), np.nan)
+    for row, (places, heights) in zip(values, curves, strict=True):
+        row[np.searchsorted(x, places)] = heights
+    return _band(x, values)
+
+
+def band_between(curves: Sequence[Curve]) -> Band:
+    """Seeds whose curves have values at places of their own, straight lines between these.
+
+    The band begins where all seeds have begun and ends where the first one ends.
+    """
+    start = max(float(places[0]) for places, _ in curves)
+    end = min(float(places[-1]) for places, _ in curves)
+    x = np.unique(np.concatenate([places for places, _ in curves]))
+    x = x[(x >= start) & (x <= end)]
+    values = np.array([np.interp(x, places, heights) for places, heights in curves])
+    return _band(x, values)
+
+
+def _band(x: Floats, values: Floats) -> Band:
+    if not len(x):
+        return Band(x, x, x, x, len(values))
+    return Band(
+        x,
+        np.nanmin(values, axis=0),
+        np.nanmedian(values, axis=0),
+        np.nanmax(values, axis=0),
+        len(values),
+    )
+
+
+def with_gaps(band: Band, longest: float) -> Band:
+    """The same band, with NaN in the middle of every stretch longer than this without a value."""
+    after = np.flatnonzero(np.diff(band.x) > longest) + 1
+    middles = (band.x[after - 1] + band.x[after]) / 2.0
+    low, median, high = (np.insert(y, after, np.nan) for y in (band.low, band.median, band.high))
+    return Band(np.insert(band.x, after, middles), low, median, high, band.seeds)
+
+
+def bootstrap_difference(
+    ours: Floats, theirs: Floats, draw: np.random.Generator, resamples: int = RESAMPLES
+) -> Difference:
+    """Difference of the means of two groups of seeds, and its 95 % percentile interval.
+
+    Both groups are drawn anew, with replacement, `resamples` times, first `ours` then `theirs`.
+
+    Raises:
+        ValueError: A group has fewer than two seeds: nothing can be said about its spread.
+    """
+    if min(len(ours), len(theirs)) < 2:
+        raise ValueError(f"expected at least 2 seeds each, got {len(ours)} and {len(theirs)}")
+    means = [
+        group[draw.integers(0, len(group), (resamples, len(group)))].mean(axis=1)
+        for group in (ours, theirs)
+    ]
+    outside = (1.0 - LEVEL) / 2.0
+    low, high = np.quantile(means[0] - means[1], (outside, 1.0 - outside))
+    return Difference(float(ours.mean() - theirs.mean()), float(low), float(high))

@@ -1,0 +1,220 @@
+"""The report: every figure where its data are, a line where they are not, sentences by rules."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import findings, report
+from experiments.comparisons import compare_all
+from experiments.document import Findings, Missing, Picture, Section, Table, html, markdown
+from experiments.figures.evaluation import Compared
+from experiments.figures.probes import chosen
+from experiments.measures import kept, number, spread
+from experiments.runs import Experiment, load
+from experiments.statistics import Difference
+from services.cli import main
+from tests.synthetic_runs import write_probes, write_route, write_run
+
+PNG = b"\x89PNG"
+
+
+def experiment(out: Path, name: str, seeds: Sequence[int] = (1,)) -> Experiment:
+    folders = [write_run(out, name, seed) for seed in seeds]
+    (found,) = load(folders)
+    return found
+
+
+def titles(section: Section) -> list[str]:
+    return [block.title for block in section.blocks if isinstance(block, Picture)]
+
+
+def missing(section: Section) -> list[str]:
+    return [block.what for block in section.blocks if isinstance(block, Missing)]
+
+
+def sentences(section: Section) -> str:
+    told = [block.sentences for block in section.blocks if isinstance(block, Findings)]
+    return "\n".join(sentence for group in told for sentence in group)
+
+
+def test_an_experiment_shows_its_figures_of_the_thesis(tmp_path: Path) -> None:
+    section = report.section_of(experiment(tmp_path, "plus-rmm"))
+    assert titles(section)[:3] == [
+        "Fitness (Fig 4.9a)",
+        "Loss (Fig 4.9b)",
+        "Memory by action (Fig 4.11)",
+    ]
+    assert missing(section) == []
+    assert "balanced, as in the thesis" in sentences(section)
+    assert "it fell, as in the thesis (Fig 4.9b)" in sentences(section)
+    table = next(block for block in section.blocks if isinstance(block, Table))
+    assert ("episodes", "7,000", "700", "700") in table.rows
+
+
+def test_an_unbalanced_memory_is_called_so(tmp_path: Path) -> None:
+    told = sentences(report.section_of(experiment(tmp_path, "plus-normm")))
+    assert "forward 55." in told
+    assert "not balanced, as in the thesis" in told
+
+
+def test_two_corridors_show_their_samples_and_predictions(tmp_path: Path) -> None:
+    section = report.section_of(experiment(tmp_path, "plus-minus"))
+    assert "Memory by corridor (Fig 4.15)" in titles(section)
+    assert "Predicted rewards in minus, last weights (Fig 4.17)" in titles(section)
+    assert "more of Minus than of Plus, as in the thesis" in sentences(section)
+
+
+def test_what_is_not_there_is_named(tmp_path: Path) -> None:
+    found = experiment(tmp_path, "i16c")
+    for path in found.runs[0].folder.iterdir():
+        if path.name != "run.json":
+            path.unlink()
+    info = found.runs[0].folder / "run.json"
+    info.write_text(info.read_text().replace('"i16c"', '"i16c-test"').replace("true", "false"))
+    (bare,) = load([tmp_path])
+    section = report.section_of(bare)
+    assert titles(section) == []
+    assert missing(section) == [
+        "the thesis's numbers",
+        "fitness and loss over episodes",
+        "samples in the memory",
+        "drives of the frozen network",
+        "predicted rewards",
+        "route (Fig 4.20)",
+    ]
+    assert "Seed 1 is not complete: 300 episodes so far." in sentences(section)
+
+
+def test_a_route_names_its_events(tmp_path: Path) -> None:
+    folder = write_run(tmp_path, "i16c", 1)
+    write_route(folder / "route-tour.npz", "plus", [(1.2, 1.2), (1.5, 1.2), (1.9, 1.2)])
+    (found,) = load([tmp_path])
+    shown = [b for b in report.section_of(found).blocks if isinstance(b, Picture)]
+    assert "1 (action 1) passes the window; 2 (action 2) turns." in shown[-1].caption
+
+
+def test_comparisons_are_drawn_when_all_their_experiments_are_there(tmp_path: Path) -> None:
+    names = ("plus-normm", "plus-normm-fit", "plus-rmm", "plus-rmm-nopretrain", "plus-minus")
+    all_of = [experiment(tmp_path, name, (1, 2)) for name in names]
+    (section,) = compare_all(all_of)
+    shown = "\n".join(titles(section))
+    for figure in ("Fig 4.5", "Fig 4.12", "Fig 4.10", "Fig 4.16", "Differences"):
+        assert figure in shown
+    assert missing(section) == []
+    assert "plus-rmm had fewer bumps than plus-normm in plus" in sentences(section)
+    assert "So it is here".lower() in sentences(section)
+    kept_table = next(b for b in section.blocks if isinstance(b, Table) and "Kept" in b.title)
+    assert [row[0] for row in kept_table.rows] == ["1", "2"]
+
+
+def test_comparisons_without_an_experiment_say_which(tmp_path: Path) -> None:
+    pair = [experiment(tmp_path, name) for name in ("plus-normm", "plus-rmm")]
+    (section,) = compare_all(pair)
+    why = {block.what: block.why for block in section.blocks if isinstance(block, Missing)}
+    assert "plus-normm-fit" in why["NoRMM going on with fitting phases (Fig 4.5)"]
+    assert "1 and 1 seeds, at least 2 each needed" in why["difference of bumps"]
+    assert "Predicted rewards in plus, plus-rmm and plus-normm (Fig 4.10)" in titles(section)
+
+
+def test_networks_asked_about_different_images_are_not_compared(tmp_path: Path) -> None:
+    write_run(tmp_path, "plus-normm", 1)
+    other = write_run(tmp_path, "plus-rmm", 1)
+    write_probes(other / "probes-best-plus.npz", "plus", np.random.default_rng(1), count=7)
+    (section,) = compare_all(load([tmp_path]))
+    assert any("different images" in b.why for b in section.blocks if isinstance(b, Missing))
+
+
+def test_one_experiment_is_not_compared(tmp_path: Path) -> None:
+    assert compare_all([experiment(tmp_path, "i16c")]) == []
+
+
+def test_policies_are_a_table_beside_the_thesis(tmp_path: Path) -> None:
+    names = ("policy-eps-greedy", "policy-roulette")
+    (section,) = compare_all([experiment(tmp_path, name, (1, 2)) for name in names])
+    table = next(block for block in section.blocks if isinstance(block, Table))
+    assert "Fig 4.2" in table.title
+    assert [row[2] for row in table.rows] == ["38", "16"]
+    assert "got farther than roulette alone, as in the thesis" in sentences(section)
+
+
+@pytest.mark.parametrize(
+    ("low", "mean", "high", "words"),
+    [
+        (-3.0, -2.0, -1.0, ["plus-rmm had fewer", "excludes 0", "so it is here"]),
+        (1.0, 2.0, 3.0, ["plus-normm had fewer", "excludes 0", "here it is not"]),
+        (-1.0, 0.5, 2.0, ["includes 0: undecided", "the thesis holds plus-rmm"]),
+        (-1.0, 0.0, 1.0, ["equally many"]),
+    ],
+)
+def test_a_difference_is_told_whichever_way_it_goes(
+    low: float, mean: float, high: float, words: list[str]
+) -> None:
+    pair = Compared("plus-rmm", "plus-normm", "plus", (3, 3), Difference(mean, low, high))
+    told = findings.difference(pair)
+    for word in words:
+        assert word in told
+
+
+def test_what_was_kept_compares_the_drives_around_the_other_corridor(tmp_path: Path) -> None:
+    before = experiment(tmp_path, "plus-rmm").runs[0]
+    run = experiment(tmp_path, "plus-minus").runs[0]
+    entry = kept(run, "plus", before)
+    assert entry is not None
+    drives = run.evaluated("plus")
+    within = drives.numbers("episode") <= run.info.stages[0].last_episode
+    assert entry.after == drives.numbers("mean_run")[within][-1]
+    assert entry.before == before.evaluated("plus").numbers("mean_run")[-1]
+    assert kept(run, "plus", None) is None  # it did not drive before its first episode
+    assert kept(before, "plus", None) is None  # it never left
+
+
+def test_numbers_are_written_with_three_digits() -> None:
+    assert [number(x) for x in (1234.5, 12.345, 3.0, -0.5, float("nan"))] == [
+        "1,234", "12.3", "3", "−0.5", "-",
+    ]  # fmt: skip
+    assert spread(np.array([3.0, 1.0, 2.0])) == "2 (1 to 3)"
+    assert spread(np.array([])) == "-"
+
+
+def test_images_shown_are_spread_over_the_set_in_order() -> None:
+    assert chosen(3, 6) == [0, 1, 2]
+    assert chosen(21, 6) == [0, 4, 8, 12, 16, 20]
+
+
+def test_text_is_escaped() -> None:
+    table = Table("<t>", ("a|b",), (("<script>",),))
+    section = Section("s", "x & y", (table, Missing("<f>", "no data")))
+    page = html("T", [section])
+    assert "<script>" not in page
+    assert "&lt;script&gt;" in page
+    assert "a\\|b" in markdown([section], "figures")
+
+
+def test_the_command_writes_pages_that_need_nothing_else(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("policy-eps-greedy", "policy-roulette"):
+        write_run(tmp_path / "runs", name, 1)
+    out = tmp_path / "out"
+    assert main(["report", str(tmp_path / "runs"), "--out", str(out), "--gpu-step-ms", "3"]) == 0
+    assert "report.html and 4 Markdown pages" in capsys.readouterr().out
+    page = (out / "report.html").read_text()
+    assert set(re.findall(r'(?:src|href)="([^"]{0,10})', page)) == {
+        "data:image", "#runs", "#policy-ep", "#policy-ro", "#compariso",
+    }  # fmt: skip
+    for path in out.glob("*.md"):
+        for picture in re.findall(r"\]\((figures/[^)]+)\)", path.read_text()):
+            assert (out / picture).read_bytes().startswith(PNG)
+    assert "projected hours" in (out / "runs.md").read_text()
+
+
+def test_the_command_refuses_a_folder_without_a_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["report", str(tmp_path)]) == 2
+    assert "expected the folder of a run" in capsys.readouterr().err
