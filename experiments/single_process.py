@@ -69,7 +69,10 @@ class SingleProcess:
                 yield done
             action = self.actor.act(observation)
             assert action.action is not None
-            observation = self._drive(action.action)
+            if self.env.driver.apply_due(action.episode):
+                observation = self.env.observe()
+            else:
+                observation = self._drive(action.action)
 
     def _drive(self, action: int) -> Observation:
         """Drive one action and look, after a bump from where the driver recovered to (E11)."""

@@ -22,6 +22,7 @@ import typer
 from services.monitor.tether import tether
 from services.options import (
     CHOOSE,
+    AtEpisode,
     ConfigFile,
     Endpoint,
     Preset,
@@ -49,8 +50,12 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-world = typer.Typer(help="Look at a simulated world without driving in it.", no_args_is_help=True)
+world = typer.Typer(
+    help="Look at simulated worlds, and let robots drive in another.", no_args_is_help=True
+)
 app.add_typer(world, name="world")
+obstacle = typer.Typer(help="Place and remove boxes where robots drive.", no_args_is_help=True)
+app.add_typer(obstacle, name="obstacle")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -234,6 +239,69 @@ _robot_command("pause", "Let robots wait after the current action, until `corrid
 _robot_command("resume", "Let paused robots drive on.")
 
 
+@world.command("switch")
+def world_switch(
+    name: Annotated[str, typer.Argument(help="World to drive in, such as minus.")],
+    start: Annotated[int, typer.Option(min=0, help="Which of its start poses.")] = 0,
+    at_episode: AtEpisode = 0,
+    run: Run = None,
+    run_dir: RunDir = None,
+    endpoint: Endpoint = None,
+    robot: Robot = None,
+) -> None:
+    """Let robots of a running simulation go on in another world.
+
+    Samples that look ahead across the change are dropped and counted.
+    """
+    change = {"kind": "switch", "world": name, "start": start, "at_episode": at_episode}
+    raise typer.Exit(_change_world(run, run_dir, endpoint, robot, change))
+
+
+@obstacle.command("place")
+def obstacle_place(
+    name: Annotated[str, typer.Argument(help="Name of the box, to remove it by.")],
+    x: Annotated[float, typer.Option(help="Of its middle, m.")],
+    y: Annotated[float, typer.Option(help="Of its middle, m.")],
+    heading_deg: Annotated[float, typer.Option(help="Direction of its length.")] = 0.0,
+    length: Annotated[float, typer.Option(help="m.")] = 0.5,
+    width: Annotated[float, typer.Option(help="m.")] = 0.5,
+    height: Annotated[float, typer.Option(help="m.")] = 0.5,
+    rgb: Annotated[tuple[int, int, int], typer.Option(help="Colour, 0..255 each.")] = (200, 60, 40),
+    at_episode: AtEpisode = 0,
+    run: Run = None,
+    run_dir: RunDir = None,
+    endpoint: Endpoint = None,
+    robot: Robot = None,
+) -> None:
+    """Let a box stand in the world of a running simulation: solid, and seen."""
+    box = {
+        "name": name,
+        "x_m": x,
+        "y_m": y,
+        "heading_deg": heading_deg,
+        "length_m": length,
+        "width_m": width,
+        "height_m": height,
+        "rgb": rgb,
+    }
+    change = {"kind": "place", "box": box, "at_episode": at_episode}
+    raise typer.Exit(_change_world(run, run_dir, endpoint, robot, change))
+
+
+@obstacle.command("remove")
+def obstacle_remove(
+    name: Annotated[str, typer.Argument(help="Name of the box.")],
+    at_episode: AtEpisode = 0,
+    run: Run = None,
+    run_dir: RunDir = None,
+    endpoint: Endpoint = None,
+    robot: Robot = None,
+) -> None:
+    """Take a box away again, one that was placed or one that belongs to the world."""
+    change = {"kind": "remove", "name": name, "at_episode": at_episode}
+    raise typer.Exit(_change_world(run, run_dir, endpoint, robot, change))
+
+
 # ---------------------------------------------------------------- without a run
 
 
@@ -350,6 +418,19 @@ def import_role(module: str, role: str) -> Any:
             f"{role}: needs the Python package {error.name}, which is not installed: "
             f"pip install 'corridor[{extra}]'"
         ) from error
+
+
+def _change_world(
+    run: str | None,
+    run_dir: Path | None,
+    endpoint: str | None,
+    robot: str | None,
+    change: dict[str, Any],
+) -> int:
+    """Wish for a change of the world of a run's robots; returns the exit code."""
+    from services.monitor.operator import change_world
+
+    return change_world(_reach(run, run_dir, endpoint), robot, **change)
 
 
 def _reach(run: str | None, run_dir: Path | None, endpoint: str | None) -> Config:

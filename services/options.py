@@ -55,3 +55,9 @@ Robot = Annotated[
     str | None,
     typer.Option(help="Id of one robot; default: all robots of the run."),
 ]
+AtEpisode = Annotated[
+    int,
+    typer.Option(
+        min=0, help="Wait until the robot has finished so many episodes; 0: change it now."
+    ),
+]

@@ -114,6 +114,19 @@ ROBOT_COMMAND = Stream(
     16,
     BUSY,
 )
+ROBOT_WORLD = Stream(
+    "robot_world",
+    "{run}/robot/{id}/world",
+    "request",
+    m.WorldChange,
+    (m.WorldChanged,),
+    "anyone",
+    "robot_driver",
+    "rare",
+    1 * KIB,
+    16,
+    BUSY,
+)
 ACTOR_STATE = Stream(
     "actor_state",
     "{run}/actor/{id}/state",
@@ -259,7 +272,7 @@ SERVICE = Stream(
 )
 
 STREAMS: tuple[Stream, ...] = (
-    OBSERVATION, ACTION, ROBOT_STATE, ROBOT_COMMAND, ACTOR_STATE,
+    OBSERVATION, ACTION, ROBOT_STATE, ROBOT_COMMAND, ROBOT_WORLD, ACTOR_STATE,
     EPISODE, PROGRESS, REPLAY_STATE, TURNS, CHANGES, SNAPSHOT, MINI_BATCH,
     LEARNER_STATE, WEIGHTS, SERVICE,
 )  # fmt: skip

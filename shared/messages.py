@@ -29,6 +29,7 @@ Few = Annotated[int, Field(ge=0, lt=2**31)]
 """Counted per submission and summed up for ever: bounded so that no sender can overflow a sum."""
 Image = Annotated[bytes, Field(min_length=IMAGE_BYTES, max_length=IMAGE_BYTES)]
 """uint8 [50, 75] grey, row by row from the top left."""
+Channel = Annotated[int, Field(ge=0, le=255)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
 
@@ -101,6 +102,9 @@ class Action(Message):
     values: tuple[float, float, float]
     """Clipped predictions Q(s, a) of the three actions, for the monitor."""
     weights_version: Count
+    episode: Count = 0
+    """Counted episodes of the robot so far, as far as the actor knows; 0 while the memory fills.
+    Changes of the world wait for it (`WorldChange.at_episode`)."""
 
 
 class RobotCommand(Message):
@@ -130,6 +134,72 @@ class RobotState(Message):
     undecodable: Count
     laps_left: Count
     laps_right: Count
+    pending_changes: Count
+    """Changes of the world that wait for their episode."""
+    refused_changes: Count
+    """Changes of the world that were refused, at once or when they were due."""
+
+
+class Box(Message):
+    """A box standing on the floor of a simulated world; metres and degrees."""
+
+    name: Ident
+    x_m: float
+    """Of its middle."""
+    y_m: float
+    heading_deg: float = 0.0
+    """Direction along which `length_m` is measured."""
+    length_m: float
+    width_m: float
+    height_m: float
+    rgb: Annotated[tuple[Channel, Channel, Channel], Field(strict=False)]
+    """Red, green, blue, 0..255."""
+
+
+class WorldChange(Message):
+    """A wish to change a simulated robot's world. Anyone to driver, answered by `WorldChanged`.
+
+    Exactly what its kind needs is set: `world` (and `start`), `box`, or `name`.
+    """
+
+    id: Annotated[str, Field(pattern=r"^([0-9a-f]{12})?$")] = ""
+    """Drawn by the sender: a wish sent again under the same id is carried out once. Empty: each
+    one counts."""
+    kind: Literal["switch", "place", "remove"]
+    at_episode: Count = 0
+    """Carried out instead of the first action whose `Action.episode` is at least this; 0: now."""
+    world: Ident | None = None
+    """switch: the world that the robot drives in from then on."""
+    start: Few = 0
+    """switch: which of that world's start poses, from 0."""
+    box: Box | None = None
+    """place: the obstacle."""
+    name: Ident | None = None
+    """remove: name of the obstacle."""
+
+    @model_validator(mode="after")
+    def _fits_kind(self) -> Self:
+        given = {key for key in ("world", "box", "name") if getattr(self, key) is not None}
+        needed = {"switch": "world", "place": "box", "remove": "name"}[self.kind]
+        if given != {needed}:
+            got = ", ".join(sorted(given)) or "neither"
+            raise ValueError(f"{self.kind}: expected {needed} and no other, got {got}")
+        return self
+
+
+class WorldChanged(Message):
+    """What became of a `WorldChange`, and the world as it is now. Driver to anyone."""
+
+    accepted: bool
+    """Carried out, or kept until its episode."""
+    reason: str = ""
+    """Why it was refused; empty if accepted."""
+    world: str
+    """The robot's world; empty where it cannot be changed."""
+    obstacles: tuple[Ident, ...]
+    """Names of what stands there."""
+    pending: Count
+    """Changes that wait for their episode."""
 
 
 # ---------------------------------------------------------------- actor -> replay

@@ -1,4 +1,4 @@
-"""Small state saved by a clean stop and taken up once by the next start."""
+"""Small state on disk: saved by a clean stop and taken up once, or kept for every next start."""
 
 from __future__ import annotations
 
@@ -39,13 +39,32 @@ def take(path: Path) -> dict[str, Any] | None:
 
     Returns None when there is no file. Raises StateError when it is damaged.
     """
+    data = _bytes(path)
+    if data is None:
+        return None
+    path.unlink()
+    return _values(path, data)
+
+
+def read(path: Path) -> dict[str, Any] | None:
+    """Read saved values and leave them there.
+
+    Returns None when there is no file. Raises StateError when it is damaged.
+    """
+    data = _bytes(path)
+    return None if data is None else _values(path, data)
+
+
+def _bytes(path: Path) -> bytes | None:
     try:
         if path.stat().st_size > LIMIT_BYTES:
             raise StateError(f"{path}: expected at most {LIMIT_BYTES} bytes of saved state")
-        data = path.read_bytes()
+        return path.read_bytes()
     except FileNotFoundError:
         return None
-    path.unlink()
+
+
+def _values(path: Path, data: bytes) -> dict[str, Any]:
     try:
         state = msgpack.unpackb(data)
     except (ValueError, msgpack.UnpackException) as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from services.replay.storage import Storage
 from services.robot_driver.sim import SimRobot
 from services.robot_driver.world import load_world
 from shared.config import Config
+from shared.messages import WorldChange
 from shared.rl.memory import ReplayMemory
 
 
@@ -30,10 +32,12 @@ class Outcome:
     version: int
 
 
-def single_process(config: Config, episodes: int) -> Outcome:
-    """Run the reference loop."""
+def single_process(config: Config, episodes: int, changes: Sequence[WorldChange] = ()) -> Outcome:
+    """Run the reference loop, with changes of the world on the way."""
     robot = SimRobot(config.robot, load_world(config.robot.world), config.run.seed)
     loop = SingleProcess(config, robot)
+    for change in changes:
+        assert loop.env.driver.change(change).accepted
     digests = []
     for done in loop.run():
         digests.append((done.commit.episode, done.submitted.digest))

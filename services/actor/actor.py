@@ -149,6 +149,7 @@ class Actor:
             greedy=greedy,
             values=(float(values[0]), float(values[1]), float(values[2])),
             weights_version=version,
+            episode=self.progress.robot_episodes,
         )
 
     def state(self) -> dict[str, Any]:

@@ -254,6 +254,7 @@ class Session:
                 greedy=False,
                 values=(0.0, 0.0, 0.0),
                 weights_version=self.actor.predictor.version,
+                episode=self.actor.progress.robot_episodes if self.actor.progress else 0,
             )
         )
 

@@ -1,18 +1,29 @@
-"""What a person tells a run from outside: stop, emergency stop, pause, and back."""
+"""What a person tells a run from outside: stop, emergency stop, pause, another world, and back."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from typing import Literal, TypeVar
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, TypeVar
 
 import typer
+from pydantic import ValidationError
 
 from shared.bus import Bus
+from shared.codec import first_problem
 from shared.config import Config
 from shared.errors import BadMessage, BusError, ConfigError, PeerMissing
-from shared.keys import IDENT, ROBOT_COMMAND, SERVICE, Peer, Stream
-from shared.messages import Message, RobotCommand, RobotState, ServiceCommand, ServiceReply
+from shared.keys import IDENT, ROBOT_COMMAND, ROBOT_WORLD, SERVICE, Peer, Stream
+from shared.messages import (
+    Message,
+    RobotCommand,
+    RobotState,
+    ServiceCommand,
+    ServiceReply,
+    WorldChange,
+    WorldChanged,
+)
+from shared.service import new_life
 
 Command = Literal["estop", "clear", "pause", "resume"]
 M = TypeVar("M", bound=Message)
@@ -34,9 +45,54 @@ def command_robots(config: Config, command: Command, robot: str | None) -> int:
         PeerMissing: there is no robot.
         RouterMissing: there is no router.
     """
+    message = RobotCommand(command=command)
+
+    def tell(bus: Bus, name: str) -> bool:
+        typer.echo(f"{name}: {_ask(bus, ROBOT_COMMAND, message, RobotState, name).state}")
+        return True
+
+    return _tell_robots(config, repr(command), robot, tell)
+
+
+def change_world(config: Config, robot: str | None, **change: Any) -> int:
+    """Wish for a change of the world of one robot or all; print what each answers.
+
+    Args:
+        config: how to reach the run.
+        robot: which robot; None: all of the run.
+        change: fields of `WorldChange`.
+
+    Returns:
+        0, or 1 if a robot did not answer or refused.
+
+    Raises:
+        ConfigError: the change or `robot` cannot be meant.
+        PeerMissing: there is no robot.
+        RouterMissing: there is no router.
+    """
+    try:
+        message = WorldChange.model_validate({"id": new_life(), **change})
+    except ValidationError as error:
+        raise ConfigError(f"{change['kind']}: {first_problem(error)}") from error
+
+    def tell(bus: Bus, name: str) -> bool:
+        answer = _ask(bus, ROBOT_WORLD, message, WorldChanged, name)
+        if not answer.accepted:
+            typer.echo(f"{name}: refused: {answer.reason}", err=True)
+            return False
+        boxes = f"obstacles {', '.join(answer.obstacles)}" if answer.obstacles else "no obstacles"
+        typer.echo(f"{name}: world {answer.world}, {boxes}, {answer.pending} changes waiting")
+        return True
+
+    return _tell_robots(config, change["kind"], robot, tell)
+
+
+def _tell_robots(
+    config: Config, what: str, robot: str | None, tell: Callable[[Bus, str], bool]
+) -> int:
+    """Tell one robot or all of the run something; 1 if `tell` was not obeyed or not answered."""
     if robot is not None and not IDENT.match(robot):
         raise ConfigError(f"--robot: expected a name like {IDENT.pattern}, got {robot!r}")
-    message = RobotCommand(command=command)
     with Bus(config.bus, config.run.name) as bus:
         present = [peer.id for peer in bus.peers() if peer.service == DRIVER]
         names = [robot] if robot is not None else present
@@ -47,12 +103,10 @@ def command_robots(config: Config, command: Command, robot: str | None) -> int:
         failed = 0
         for name in names:
             try:
-                state = _ask(bus, ROBOT_COMMAND, message, RobotState, name)
+                failed += not tell(bus, name)
             except (BusError, BadMessage) as error:
                 failed += 1
-                typer.echo(f"{name}: no answer to {command!r}: {error}", err=True)
-                continue
-            typer.echo(f"{name}: {state.state}")
+                typer.echo(f"{name}: no answer to {what}: {error}", err=True)
     return 1 if failed else 0
 
 

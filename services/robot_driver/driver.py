@@ -10,11 +10,19 @@ import math
 from collections.abc import Callable
 from typing import Any, Literal
 
+from services.robot_driver.changes import Changes, Outcome, described
 from services.robot_driver.recovery import Halted, WatchedRobot, back_off
 from services.robot_driver.robot import STANDSTILL, Pose, Robot, Velocity
 from services.robot_driver.safety import Safety
 from shared.config import Config
-from shared.messages import Action, Interruption, Observation, RobotState
+from shared.messages import (
+    Action,
+    Interruption,
+    Observation,
+    RobotState,
+    WorldChange,
+    WorldChanged,
+)
 from shared.rl.draws import generator
 from shared.rl.policy import FORWARD_LEFT, FORWARD_RIGHT
 
@@ -39,14 +47,24 @@ class Driver:
         self.state: State = "waiting"
         self.watch: Callable[[], None] = lambda: None
         """Called while the robot recovers, so that commands take effect then too."""
+        self.tell: Callable[[str], None] = lambda _line: None
+        """Called with what became of each change of the world, for a log."""
+        self.keep: Callable[[dict[str, Any]], None] = lambda _kept: None
+        """Called, before a change of the world is acknowledged, with what must outlive a kill."""
         self.sequence = 0
         self.attempt = 0
         self.bumps = self.recoveries = self.late_actions = self.refused_actions = 0
-        self.resent_observations = 0
+        self.resent_observations = self.refused_changes = 0
+        self._changes = Changes(robot)
         self._bump = False
         self._interruption: Interruption = ""
         self._moving = False
         self._pose = Pose(0.0, 0.0, 0.0)
+
+    @property
+    def world(self) -> str:
+        """Name of the world the robot drives in now."""
+        return self._changes.world or self._config.robot.world
 
     def observe(self) -> Observation:
         """Sense now, as the observation that the next action answers. Raises RobotFault."""
@@ -64,7 +82,7 @@ class Driver:
             heading_rad=sensed.pose.heading_rad,
             bump=self._bump,
             interruption=self._interruption,
-            world=self._config.robot.world,
+            world=self.world,
             period_s=self._config.robot.period_s,
             stamp_s=self._robot.now_s(),
             laps_left=left,
@@ -150,6 +168,35 @@ class Driver:
         if self.safety.halted:
             self.halt()
 
+    def change(self, wish: WorldChange, *, at_once: bool = False) -> WorldChanged:
+        """Take a wish to change the world: it waits for its episode, or is refused.
+
+        With `at_once`, while the robot waits between actions, what need not wait is carried out now
+        and not instead of the next action. A refusal is counted and told.
+        """
+        if (known := self._changes.known(wish)) is not None:
+            return known
+        try:
+            self._changes.add(wish)
+        except ValueError as error:
+            self._refused(wish, str(error))
+            return self._changes.answer(wish, str(error))
+        outcomes = self._carry_out(0) if at_once else []
+        self.keep(self._changes.kept())
+        refusal = next((outcome.refusal for outcome in outcomes if outcome.change is wish), "")
+        return self._changes.answer(wish, refusal)
+
+    def apply_due(self, episode: int) -> bool:
+        """Carry out the changes that are due in this episode of the robot, if any.
+
+        Call it with `Action.episode` of the action that answers the newest observation. True: do
+        not execute that action, look again instead (same sequence, next attempt).
+        """
+        outcomes = self._carry_out(episode)
+        if outcomes:
+            self.keep(self._changes.kept())
+        return bool(outcomes)
+
     def report(self, undecodable: int) -> RobotState:
         """The heartbeat."""
         left, right = self._laps()
@@ -164,7 +211,7 @@ class Driver:
             x_m=self._pose.x_m,
             y_m=self._pose.y_m,
             heading_rad=self._pose.heading_rad,
-            world=self._config.robot.world,
+            world=self.world,
             bumps=self.bumps,
             recoveries=self.recoveries,
             deadman_stops=self.safety.deadman_stops,
@@ -175,16 +222,19 @@ class Driver:
             undecodable=undecodable,
             laps_left=left,
             laps_right=right,
+            pending_changes=len(self._changes.pending),
+            refused_changes=self.refused_changes,
         )
 
     def saved(self) -> dict[str, Any]:
         """Everything a later process needs to continue exactly here, for msgpack."""
         names = (
             "life sequence attempt bumps recoveries late_actions refused_actions "
-            "resent_observations _bump _interruption"
+            "resent_observations refused_changes _bump _interruption"
         )
         return {
             "robot": self._robot.state(),
+            "changes": self._changes.saved(),
             "estop": self.safety.estop,
             **{name: getattr(self, name) for name in names.split()},
         }
@@ -194,14 +244,41 @@ class Driver:
         if saved.keys() != self.saved().keys():
             odd = sorted(saved.keys() ^ self.saved().keys())
             raise KeyError(f"missing or unknown: {', '.join(odd)}")
+        self._changes.restore(saved["changes"])
         self._robot.restore(saved["robot"])
         self.safety.estop = bool(saved["estop"])
-        for name in saved.keys() - {"robot", "estop"}:
+        for name in saved.keys() - {"robot", "changes", "estop"}:
             setattr(self, name, type(getattr(self, name))(saved[name]))
+
+    def restore_kept(self, kept: dict[str, Any]) -> None:
+        """Begin anew in the world that an earlier, killed driver gave to `keep`.
+
+        Raises KeyError, TypeError or ValueError when it does not fit.
+        """
+        self._changes.restore_kept(kept)
 
     @property
     def _realtime(self) -> bool:
         return self._config.robot.timing == "realtime"
+
+    def _carry_out(self, episode: int) -> list[Outcome]:
+        """Carry out what is due; the robot then stands still and looks again."""
+        outcomes = self._changes.carry_out(episode)
+        switched = False
+        for outcome in outcomes:
+            if outcome.refusal:
+                self._refused(outcome.change, outcome.refusal)
+            else:
+                switched |= outcome.change.kind == "switch"
+                self.tell(f"world: {described(outcome.change)}")
+        if outcomes:
+            self.halt()
+            self.look_again("world" if switched else "")
+        return outcomes
+
+    def _refused(self, change: WorldChange, reason: str) -> None:
+        self.refused_changes += 1
+        self.tell(f"world: refused to {described(change)}: {reason}")
 
     def _laps(self) -> tuple[int, int]:
         laps = getattr(self._robot, "laps", None)  # only worlds that know have them

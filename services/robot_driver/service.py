@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,12 +13,16 @@ from shared import statefile
 from shared.bus import Inbox
 from shared.config import Config
 from shared.errors import ConfigError, StateError
-from shared.keys import ACTION, OBSERVATION, ROBOT_COMMAND, ROBOT_STATE
-from shared.messages import Action, Observation, RobotCommand
+from shared.keys import ACTION, OBSERVATION, ROBOT_COMMAND, ROBOT_STATE, ROBOT_WORLD
+from shared.messages import Action, Observation, RobotCommand, WorldChange
 from shared.service import TICK_S, Service, new_life, service
 
 if TYPE_CHECKING:
     from services.robot_driver.sim import Laps, SimRobot
+    from services.robot_driver.world import Obstacle, World
+
+STATE, WORLD = "state.msgpack", "world.msgpack"
+"""Files of a robot: all of a driver that was stopped; its world, also of one that was killed."""
 
 
 def make_robot(config: Config) -> Robot:
@@ -35,13 +40,12 @@ def make_robot(config: Config) -> Robot:
 
 def run(config: Config, folder: Path) -> None:
     """Drive one robot until stopped; a clean stop saves where it is."""
-    path = folder / "robot" / config.robot.id / "state.msgpack"
+    own = folder / "robot" / config.robot.id
     robot = make_robot(config)
     driver = Driver(config, robot, new_life())
     try:
-        saved = statefile.take(path)
-        if saved is not None:
-            _restore(driver, saved, path)
+        _restore(driver, own)
+        driver.keep = functools.partial(statefile.save, own / WORLD)
         with service("driver", config.robot.id, config, life=driver.life) as me:
             loop = DriverLoop(me, driver, folder)
             try:
@@ -50,15 +54,22 @@ def run(config: Config, folder: Path) -> None:
                 driver.halt()
                 driver.state = "stopped"
                 loop.beat(force=True)
-            statefile.save(path, driver.saved())
+            statefile.save(own / STATE, driver.saved())
     finally:
         driver.halt()
         robot.close()
 
 
-def _restore(driver: Driver, saved: dict[str, object], path: Path) -> None:
+def _restore(driver: Driver, own: Path) -> None:
+    """Continue after a clean stop; after a kill begin anew, but in the world as it was."""
+    path = own / STATE
     try:
-        driver.restore(saved)
+        if (saved := statefile.take(path)) is not None:
+            driver.restore(saved)
+            return
+        path = own / WORLD
+        if (kept := statefile.read(path)) is not None:
+            driver.restore_kept(kept)
     except (KeyError, TypeError, ValueError) as error:
         raise StateError(f"{path}: saved state of the robot does not fit: {error}") from error
 
@@ -72,11 +83,13 @@ class DriverLoop:
         self._inbox: Inbox = me.bus.inbox()
         self._inbox.subscribe(ACTION, self._robot)
         self._inbox.serve(ROBOT_COMMAND, self._robot)
+        self._inbox.serve(ROBOT_WORLD, self._robot)
         me.stop.on_set(self._inbox.wake)
         self._next_beat_s = 0.0
         self._estop_mark = folder / "robot" / self._robot / "estop"
         driver.safety.estop |= self._estop_mark.exists()
         driver.watch = self.beat
+        driver.tell = me.log.info
 
     def run(self) -> None:
         """Turn after turn until the service is to stop."""
@@ -94,6 +107,10 @@ class DriverLoop:
                     self._remember_estop()
                     self._me.log.info("operator: %s", request.message.command)
                     request.reply(self._driver.report(self._inbox.refused_total))
+                    force = True
+                elif isinstance(request.message, WorldChange):
+                    between_actions = self._driver.state == "waiting"
+                    request.reply(self._driver.change(request.message, at_once=between_actions))
                     force = True
         now_s = time.monotonic()
         if force or now_s >= self._next_beat_s:
@@ -114,7 +131,7 @@ class DriverLoop:
         """One observation, answered by one action; simulated time stands still meanwhile."""
         observation = self._driver.observe()
         action = self._await_answer(observation)
-        if action is None:
+        if action is None or self._driver.apply_due(action.episode):
             return
         if action.action is None:
             self._driver.look_again("")
@@ -158,6 +175,8 @@ class DriverLoop:
             for _, action in self._inbox.take(ACTION, Action):
                 if started or hold or not driver.answers(action):
                     continue
+                if driver.apply_due(action.episode):
+                    return
                 if action.action is None:
                     hold = True
                     driver.halt()
@@ -191,6 +210,17 @@ class PacedRobot:
         self.sense, self.feel, self.drive = robot.sense, robot.feel, robot.drive
         self.now_s, self.close = robot.now_s, robot.close
         self.state, self.restore = robot.state, robot.restore
+        self.place, self.remove, self.switch = robot.place, robot.remove, robot.switch
+
+    @property
+    def world(self) -> World:
+        """The simulated world."""
+        return self._robot.world
+
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """What stands in it."""
+        return self._robot.obstacles
 
     @property
     def laps(self) -> Laps:

@@ -25,6 +25,7 @@ from shared.messages import (
     Observation,
     ReplayState,
     RobotState,
+    WorldChange,
 )
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
@@ -68,6 +69,8 @@ def example(stream: Stream) -> Message:
         return make_observation(0, robot="robotino1")
     if stream.request is MiniBatchRequest:
         return MiniBatchRequest(size=1, key=1)
+    if stream.request is WorldChange:
+        return WorldChange(kind="remove", name="box")
     return message(stream.request)
 
 
@@ -98,6 +101,7 @@ def refused(cluster: Cluster, stream: Stream) -> int:
         "observation": ("actor/robotino1/state", ActorState),
         "action": ("robot/robotino1/state", RobotState),
         "robot_command": ("robot/robotino1/state", RobotState),
+        "robot_world": ("robot/robotino1/state", RobotState),
         "replay_state": ("learner/main/state", LearnerState),
         "weights": ("learner/main/state", LearnerState),
         "learner_state": ("actor/robotino1/state", ActorState),

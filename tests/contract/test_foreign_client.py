@@ -125,6 +125,66 @@ def test_foreign_actor_drives_our_robot_for_50_actions(cluster: Cluster, client:
     assert state["bumps"] >= bumps
 
 
+def test_foreign_client_changes_the_world_of_our_robot(cluster: Cluster, client: Client) -> None:
+    observations = client.subscribe("robot/robotino1/observation")
+    cluster.start("driver")
+    first = wait_for(observations, sequence=0, attempt=0)
+    key = "robot/robotino1/world"
+
+    def change(**fields: Any) -> dict[str, Any]:
+        (answer,) = client.ask(key, pack("WorldChange", **fields))
+        assert answer["t"] == "WorldChanged"
+        return answer
+
+    box = {"name": "b1", "x_m": 3.8, "y_m": 1.0, "length_m": 0.6, "width_m": 0.6}
+    box |= {"height_m": 0.6, "rgb": [250, 0, 0]}
+    placed = change(kind="place", box=box, id="00000000000b")
+    assert (placed["accepted"], placed["world"], placed["obstacles"]) == (True, "plus", ["b1"])
+    seen = wait_for(observations, sequence=0, attempt=1)
+    assert (seen["interruption"], seen["world"]) == ("", "plus")
+    assert seen["image"] != first["image"]
+    assert change(kind="place", box=box, id="00000000000b") == placed  # sent again: done once
+    # What cannot be is refused with a reason; what is no change at all, with an error.
+    for fields, reason in (
+        ({"kind": "place", "box": box}, "there is already an obstacle 'b1'"),
+        ({"kind": "place", "box": {**box, "name": "b2", "y_m": 0.0}}, "would overlap the robot"),
+        ({"kind": "switch", "world": "maze"}, "no world named 'maze'"),
+        ({"kind": "switch", "world": "minus", "start": 99}, "expected a start from 0 to"),
+    ):
+        refused = change(**fields)
+        assert (refused["accepted"], refused["obstacles"]) == (False, ["b1"])
+        assert reason in refused["reason"]
+    for fields in ({"kind": "switch"}, {"kind": "place", "box": {"name": "b3"}}, {"kind": "burn"}):
+        (error,) = client.refusals(key, pack("WorldChange", **fields))
+        assert error.startswith("bad message: ")
+    # At an episode: instead of the first action that tells it.
+    assert change(kind="switch", world="minus", at_episode=2)["pending"] == 1
+    attempt = wait_for(observations, sequence=0, world="plus")["attempt"]
+    for sequence, episode in ((0, 0), (1, 1), (2, 2)):
+        client.session.put(
+            f"{client.run}/actor/robotino1/action",
+            pack(
+                "Action",
+                robot="robotino1",
+                actor_life=LIFE,
+                robot_life=first["life"],
+                sequence=sequence,
+                attempt=attempt if sequence == 0 else 0,
+                action=1,
+                greedy=False,
+                values=[0.0, 0.0, 0.0],
+                weights_version=0,
+                episode=episode,
+            ),
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
+        wait_for(observations, sequence=min(sequence + 1, 2), attempt=int(episode == 2))
+    seen = wait_for(observations, sequence=2, attempt=1)
+    assert (seen["world"], seen["interruption"]) == ("minus", "world")
+    state = client.ask("robot/robotino1/command", pack("RobotCommand", command="pause"))[0]
+    assert (state["world"], state["pending_changes"], state["refused_changes"]) == ("minus", 0, 4)
+
+
 def test_foreign_driver_is_driven_for_50_actions(cluster: Cluster, client: Client) -> None:
     actions = client.subscribe("actor/cube/action")
     cluster.start("replay", "learner", "actor")

@@ -14,14 +14,17 @@ from waiting import wait_until
 from services import cli
 from shared.bus import Bus
 from shared.config import Config
-from shared.keys import LEARNER_STATE, REPLAY_STATE, ROBOT_COMMAND
+from shared.keys import LEARNER_STATE, REPLAY_STATE, ROBOT_COMMAND, ROBOT_WORLD
 from shared.messages import (
+    Box,
     LearnerState,
     Message,
     ReplayState,
     RobotCommand,
     RobotState,
     ServiceCommand,
+    WorldChange,
+    WorldChanged,
 )
 from shared.settings import load
 
@@ -141,6 +144,86 @@ def test_a_command_that_nobody_hears_fails_in_one_line(
     )
     assert cli.main(["estop", *options, "--robot", "r9"]) == 1
     assert capsys.readouterr().err.startswith("r9: no answer to 'estop'")
+
+
+PLACED = Box(
+    name="b1",
+    x_m=1.0,
+    y_m=-2.5,
+    heading_deg=30.0,
+    length_m=0.4,
+    width_m=0.5,
+    height_m=0.5,
+    rgb=(1, 2, 3),
+)
+
+
+@pytest.mark.parametrize(
+    ("command", "wish"),
+    [
+        (
+            "world switch minus --start 1 --at-episode 20",
+            WorldChange(kind="switch", world="minus", start=1, at_episode=20),
+        ),
+        (
+            "obstacle place b1 --x 1 --y -2.5 --heading-deg 30 --length 0.4 --rgb 1 2 3",
+            WorldChange(kind="place", box=PLACED),
+        ),
+        ("obstacle remove b1", WorldChange(kind="remove", name="b1")),
+    ],
+)
+def test_changes_of_the_world_reach_robots_and_print_what_they_answer(
+    command: str,
+    wish: WorldChange,
+    config: Config,
+    options: list[str],
+    watching: Bus,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    heard: list[Message] = []
+    answers = {
+        "r1": message(WorldChanged, accepted=True, world="plus", obstacles=("a", "b"), pending=2),
+        "r2": message(WorldChanged, accepted=False, reason="no such thing", obstacles=()),
+    }
+
+    with ExitStack() as stack:
+        for robot, told in answers.items():
+
+            def answer(request: Message, told: WorldChanged = told) -> WorldChanged:
+                heard.append(request)
+                return told
+
+            stack.enter_context(fake_service(config, "driver", robot, []))
+            stack.enter_context(answering(config.bus, config.run.name, ROBOT_WORLD, robot, answer))
+        wait_for_peers(watching, 2)
+        assert cli.main([*command.split(), *options, "--robot", "r1"]) == 0
+        assert capsys.readouterr().out == "r1: world plus, obstacles a, b, 2 changes waiting\n"
+        assert cli.main([*command.split(), *options]) == 1
+        assert capsys.readouterr().err == "r2: refused: no such thing\n"
+    ids = [request.id for request in heard if isinstance(request, WorldChange)]
+    assert ids[0] not in ("", ids[1])
+    assert ids[1] == ids[2]
+    assert heard == [wish.model_copy(update={"id": ident}) for ident in ids]
+
+
+@pytest.mark.parametrize(
+    ("command", "complaint"),
+    [
+        ("world switch Nowhere!", "corridor: switch: world: "),
+        ("world switch minus --at-episode -1", "corridor: Invalid value for '--at-episode'"),
+        ("obstacle place box --x nan --y 0", "corridor: place: box.x_m: "),
+        ("obstacle place box --x 1 --y 0 --rgb 1 2 300", "corridor: place: box.rgb.2: "),
+        ("obstacle place box --x 1", "corridor: Missing option '--y'"),
+        ("obstacle remove box --robot A!", "corridor: --robot: expected a name"),
+    ],
+)
+def test_changes_that_cannot_be_meant_are_refused_before_anything_is_sent(
+    command: str, complaint: str, options: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main([*command.split(), *options]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(complaint)
+    assert error.count("\n") == 1
 
 
 def test_stop_reaches_chosen_services_and_tells_who_stays(

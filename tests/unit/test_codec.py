@@ -113,11 +113,26 @@ def changes(draw: st.DrawFn) -> m.Change:
     return m.Change(number=number, last=last, kind=kind, **arrays)  # type: ignore[arg-type]
 
 
+@st.composite
+def world_changes(draw: st.DrawFn) -> m.WorldChange:
+    names = values_of(str, {"pattern": "^[a-z0-9][a-z0-9_-]{0,40}$"})
+    kind = draw(st.sampled_from(["switch", "place", "remove"]))
+    what: dict[str, Any] = {
+        "switch": {"world": draw(names), "start": draw(st.integers(0, 2**31 - 1))},
+        "place": {"box": draw(made_up(m.Box))},
+        "remove": {"name": draw(names)},
+    }[kind]
+    number, ident = draw(st.integers(0, 2**63 - 1)), draw(st.sampled_from(["", "0" * 12]))
+    return m.WorldChange(kind=kind, id=ident, at_episode=number, **what)  # type: ignore[arg-type]
+
+
 def made_up(cls: type[m.Message]) -> st.SearchStrategy[Any]:
     if cls is m.Episode:
         return episodes()
     if cls is m.Change:
         return changes()
+    if cls is m.WorldChange:
+        return world_changes()
     fields = {
         name: values_of(field.annotation, limits_of(field.metadata))
         for name, field in cls.model_fields.items()
@@ -134,8 +149,12 @@ def plain(cls: type[m.Message]) -> m.Message:
         return make_observation(4)
     if cls is m.Turns:
         return m.Turns(turns=(message(m.Turn), message(m.Turn)))
-    least_one = {m.MiniBatchRequest: {"size": 1}, m.Weights: {"parts": 1}}
-    return message(cls, **least_one.get(cls, {}))
+    given: dict[type[m.Message], dict[str, Any]] = {
+        m.MiniBatchRequest: {"size": 1},
+        m.Weights: {"parts": 1},
+        m.WorldChange: {"world": "plus"},
+    }
+    return message(cls, **given.get(cls, {}))
 
 
 def fields_of(some: m.Message) -> dict[str, Any]:
@@ -212,12 +231,13 @@ def test_bytes_are_a_map_with_version_and_type_first(cls: type[m.Message]) -> No
                 greedy=False,
                 values=(0.0, -1.0, 0.5),
                 weights_version=3,
+                episode=5,
             ),
-            b"\x8b\xa1v\x01\xa1t\xa6Action\xa5robot\xa2r1\xaaactor_life\xac0123456789ab"
+            b"\x8c\xa1v\x01\xa1t\xa6Action\xa5robot\xa2r1\xaaactor_life\xac0123456789ab"
             b"\xaarobot_life\xacba9876543210\xa8sequence\x07\xa7attempt\x01\xa6action\xc0"
             b"\xa6greedy\xc2\xa6values\x93\xcb\x00\x00\x00\x00\x00\x00\x00\x00"
             b"\xcb\xbf\xf0\x00\x00\x00\x00\x00\x00\xcb\x3f\xe0\x00\x00\x00\x00\x00\x00"
-            b"\xafweights_version\x03",
+            b"\xafweights_version\x03\xa7episode\x05",
         ),
         (
             m.Change(number=2, last=True, kind="discard", ids=b"\x09" + bytes(7)),
@@ -520,3 +540,23 @@ def test_episode_that_contradicts_itself_about_its_end_is_refused(ended: str, bu
     fields = {**make_episode(2).model_dump(), "ended": ended, "bump": bump}
     with pytest.raises(ValueError, match="but the episode ended"):
         m.Episode(**fields)
+
+
+@pytest.mark.parametrize(
+    ("fields", "complaint"),
+    [
+        ({"kind": "switch"}, "switch: expected world and no other, got neither"),
+        ({"kind": "switch", "name": "a"}, "switch: expected world and no other, got name"),
+        ({"kind": "remove", "name": "a", "world": "plus"}, "remove: expected name and no other"),
+        ({"kind": "place", "name": "a"}, "place: expected box and no other"),
+        ({"kind": "place", "box": {"name": "a"}}, "box.x_m: Field required"),
+        ({"kind": "remove", "name": "a", "at_episode": -1}, "at_episode: "),
+        ({"kind": "remove", "name": "a", "id": "1"}, "id: "),
+        ({"kind": "remove", "name": "A b"}, "name: "),
+        ({"kind": "burn", "name": "a"}, "kind: "),
+    ],
+)
+def test_a_change_of_the_world_names_exactly_what_its_kind_needs(
+    fields: dict[str, Any], complaint: str
+) -> None:
+    assert complaint in refused({"v": 1, "t": "WorldChange", **fields}, m.WorldChange)

@@ -371,7 +371,7 @@ def test_a_saved_emergency_stop_stays_latched() -> None:
     assert robot.velocity == STANDSTILL
 
 
-@pytest.mark.parametrize("missing", ["robot", "estop"])
+@pytest.mark.parametrize("missing", ["robot", "changes", "estop"])
 def test_a_saved_state_without_its_parts_is_refused(missing: str) -> None:
     driver, _ = make_driver()
     saved = driver.saved()

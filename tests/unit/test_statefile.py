@@ -21,6 +21,16 @@ def test_saved_values_come_back_once(tmp_path: Path) -> None:
     assert list(path.parent.iterdir()) == []
 
 
+def test_values_that_are_kept_can_be_read_again_and_again(tmp_path: Path) -> None:
+    path = tmp_path / "kept"
+    assert statefile.read(path) is None
+    statefile.save(path, STATE)
+    assert statefile.read(path) == statefile.read(path) == STATE
+    path.write_bytes(b"\xc1")
+    with pytest.raises(StateError, match="damaged"):
+        statefile.read(path)
+
+
 def test_a_later_state_takes_the_place_of_an_earlier_one(tmp_path: Path) -> None:
     path = tmp_path / "state"
     statefile.save(path, {"n": 1})
