@@ -19,7 +19,7 @@ from services.replay import numbering
 from services.replay.numbering import Commit, Counters
 from services.robot_driver.sim import SimRobot
 from shared.config import Config
-from shared.messages import Episode, Observation
+from shared.messages import Episode, Observation, RobotProgress
 from shared.rl.learning import Trained, Trainer
 from shared.rl.memory import ReplayMemory
 from shared.rl.network import to_bytes
@@ -53,19 +53,29 @@ class SingleProcess:
         self.trainer = Trainer(
             config.network, config.learning, config.numerics.learner, config.run.seed
         )
-        self._publish()
+        self.publish()
+
+    def reconfigure(self, config: Config) -> None:
+        """Go on with other settings of policy, memory and learning, as a new stage begins.
+
+        Call between turns. The world changes by way of the driver.
+        """
+        self.config = config
+        self.memory.set_capacity(config.memory.capacity)
+        self.trainer.configure(config.learning)
+        self.actor.configure(config)
+        if self.actor.progress is not None:
+            self.actor.progress = self._progress()
 
     def run(self) -> Iterator[TurnDone]:
         """Drive and learn for ever; yields after every submission, fill ones included."""
-        config, robot = self.config, self.config.robot.id
         observation: Observation = self.env.reset()[1]["observation"]
-        self.actor.begin(numbering.progress_of(self.counters, config.memory, robot), observation)
+        self.actor.begin(self._progress(), observation)
         while True:
             submission = self.actor.finish(observation)
             if submission is not None:
                 done = self._turn(submission)
-                progress = numbering.progress_of(self.counters, config.memory, robot)
-                self.actor.committed(progress)
+                self.actor.committed(self._progress())
                 yield done
             action = self.actor.act(observation)
             assert action.action is not None
@@ -81,6 +91,9 @@ class SingleProcess:
             _, info = self.env.reset()
         observation: Observation = info["observation"]
         return observation
+
+    def _progress(self) -> RobotProgress:
+        return numbering.progress_of(self.counters, self.config.memory, self.config.robot.id)
 
     def _turn(self, episode: Episode) -> TurnDone:
         """Append -> discard -> equalise -> train or fit -> target rule -> publish (E25)."""
@@ -99,10 +112,10 @@ class SingleProcess:
         trained = tuple(self.trainer.learn(self.memory, commit.episode))
         changed = self.trainer.apply_target_rule(commit.episode, episode.bump)
         if changed:
-            self._publish()
+            self.publish()
         return TurnDone(commit, episode, maintenance, trained, changed)
 
-    def _publish(self) -> None:
+    def publish(self) -> None:
         """Acting, rewards, descriptors and equalisation all use the newest target (A26, E14)."""
         data = to_bytes(self.trainer.target_network)
         for predictor in (self.acting, self.judging):

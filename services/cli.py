@@ -313,6 +313,35 @@ def show_config(preset: Preset = None, config: ConfigFile = None, set_: Set = No
     typer.echo(to_toml(_load(preset, config, set_)), nl=False)
 
 
+@app.command()
+def experiment(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[NAME]...", help="Plans, such as plus-rmm; none: list them."),
+    ] = None,
+    scale: Annotated[
+        str, typer.Option(help="full: the thesis's constants; mini: minutes instead of days.")
+    ] = "mini",
+    seeds: Annotated[
+        int, typer.Option(min=1, help="How many of the plan's seeds, from the first.")
+    ] = 1,
+    seed: Annotated[int | None, typer.Option(help="This seed alone.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, max=64, help="Runs side by side.")] = 1,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of all runs; default runs/experiments.")
+    ] = None,
+) -> None:
+    """Run experiments in this process, without a router; run again, they go on.
+
+    A plan that begins with the end of another runs that one first.
+    """
+    commands = import_role("experiments.commands", "experiments")
+    if not names:
+        typer.echo(commands.listing())
+        return
+    raise typer.Exit(commands.run(names, scale, seeds, seed, jobs, out))
+
+
 @world.command("render")
 def world_render(
     name: Annotated[str, typer.Argument(help="Name of the world, such as plus.")],

@@ -71,6 +71,11 @@ def preset_names() -> list[str]:
     return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
 
 
+def preset_tree(preset: str) -> Tree:
+    """The tables of a preset: what it changes. Raises ConfigError for one that is not there."""
+    return _read_preset(preset)[0]
+
+
 def keys(section: type[Section] = Config, prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
     """All settings as dotted keys with their field, in the order of the tree."""
     for name, field in section.model_fields.items():
@@ -272,7 +277,13 @@ def _read_preset(preset: str) -> tuple[Tree, str]:
         return _read_toml(Path(preset), "preset file"), f"preset file {preset}"
     if preset not in preset_names():
         known = ", ".join(preset_names())
-        raise ConfigError(f"--preset: expected one of {known} or a .toml file, got {preset!r}")
+        plans = resources.files("experiments").joinpath("plans")
+        hint = ""
+        if plans.joinpath(f"{preset}.toml").is_file():
+            hint = f"; {preset} is an experiment: corridor experiment {preset}"
+        raise ConfigError(
+            f"--preset: expected one of {known} or a .toml file, got {preset!r}{hint}"
+        )
     text = resources.files("experiments").joinpath("presets", f"{preset}.toml").read_bytes()
     return _parse(text, f"preset {preset}"), f"preset {preset}"
 

@@ -52,6 +52,10 @@ class Actor:
         """Whether actions gather samples for filling the memory (A13, E9)."""
         return self.progress is not None and self.progress.filling
 
+    def configure(self, config: Config) -> None:
+        """Go on with other settings of policy and memory. Call between episodes."""
+        self._config = config
+
     def begin(self, progress: RobotProgress, observation: Observation) -> None:
         """Start with what replay has of this robot; count what an earlier actor process lost.
 

@@ -64,6 +64,12 @@ class Trainer:
         self.steps_at_copy = 0
         self.episode_at_copy = 0
 
+    def configure(self, learning: LearningConfig) -> None:
+        """Go on with another schedule, target rule or rate. Call between episodes."""
+        self._learning = learning
+        for group in self._optimiser.param_groups:
+            group["lr"] = learning.learning_rate
+
     def learn(self, samples: SampleStore, episode: int) -> Iterator[Trained]:
         """Everything the network learns at one episode (E25); yields after each mini-batch.
 

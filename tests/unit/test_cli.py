@@ -123,7 +123,7 @@ def test_a_folder_of_another_configuration_is_refused_by_services_too(
 ) -> None:
     settings.claim(Path("runs/demo"), settings.load("demo"))
     for command in ("up", "driver", "actor", "replay", "learner"):
-        assert "memory.capacity is 6000 there, but 45000 now" in refused(capsys, 2, command)
+        assert "episode.max_samples is 200 there, but 500 now" in refused(capsys, 2, command)
 
 
 def test_a_damaged_folder_is_exit_code_3(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,219 @@
+"""Plans: what an experiment of the thesis consists of, as data (A38-A46).
+
+A plan is a TOML file in `plans/`: a configuration (differences to the defaults only), stages that
+change parts of it while the run goes on, and the plan whose end it begins with. `full` has the
+exact constants; `mini` has the same shape, with episodes and memories divided by the plan's factor
+(the counts of the memory follow, E17b) and a narrower network.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from importlib import resources
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, ValidationError, model_validator
+
+from shared.config import Config, Name, Section
+from shared.errors import ConfigError
+from shared.settings import preset_tree
+
+Scale = Literal["full", "mini"]
+SCALES: tuple[Scale, ...] = ("full", "mini")
+Tree = dict[str, Any]
+DIVIDED = (
+    ("memory", "capacity"),
+    ("memory", "capacity_max"),
+    ("memory", "capacity_step"),
+    ("memory", "equalise_every"),
+    ("learning", "fit_every"),
+)
+"""What a smaller scale divides beside the episodes: sizes, and periods counted in episodes."""
+
+
+class Stage(Section):
+    """A part of a run with a configuration of its own."""
+
+    name: Name
+    until: Annotated[int, Field(ge=1)]
+    """Last episode of the stage, counted from the plan's first."""
+    config: Tree = Field(default_factory=dict)
+    """What changes as the stage begins; later stages keep it."""
+    force_candidates: bool = False
+    """Mark all samples stored so far by decree as the stage begins (A44)."""
+    changes: Annotated[tuple[Tree, ...], Field(strict=False)] = ()
+    """Worlds and obstacles that change on the way: fields of `WorldChange`, `at_episode` counted
+    from the plan's first episode."""
+
+
+class Mini(Section):
+    """How the small scale differs."""
+
+    factor: Annotated[int, Field(ge=1, le=1000)]
+    """Episodes, memories, and periods in episodes are divided by it."""
+    mini_batches: Annotated[int, Field(ge=1, le=100)] = 1
+    """Mini-batches after an episode are multiplied by it: a network needs its training steps,
+    however small the memory."""
+    config: Tree = Field(default_factory=dict)
+
+
+class Evaluation(Section):
+    """Frozen drives during a run."""
+
+    starts: Annotated[int, Field(ge=1, le=1000)] = 16
+    """At the end of a stage."""
+    actions: Annotated[int, Field(ge=50, le=100_000)] = 400
+    every_actions: Annotated[int, Field(ge=1)] = 100_000
+    """On the way: how often."""
+    every_starts: Annotated[int, Field(ge=1, le=1000)] = 8
+    every_length: Annotated[int, Field(ge=50, le=100_000)] = 200
+    """On the way: actions from each start."""
+    lap_every_actions: Annotated[int, Field(ge=0)] = 0
+    """How often to look whether the frozen policy drives a lap already, until it does; 0: never."""
+    worlds: Annotated[tuple[Name, ...], Field(strict=False)] = ()
+    """Where to drive as a stage ends; empty: in the world of the stage."""
+
+
+class Plan(Section):
+    """An experiment."""
+
+    name: Name
+    title: str
+    source: str
+    """Where the thesis describes it."""
+    after: str = ""
+    """The plan whose end this one begins with: weights, optimiser, memory, robot (A46)."""
+    preset: str = ""
+    """A preset that `config` differs from; empty: the defaults."""
+    thesis: dict[str, float] = Field(default_factory=dict)
+    """Figures of the thesis, to stand beside ours."""
+    config: Tree = Field(default_factory=dict)
+    stages: Annotated[tuple[Stage, ...], Field(min_length=1, strict=False)]
+    seeds: Annotated[tuple[int, ...], Field(min_length=1, strict=False)] = (1, 2, 3, 4, 5)
+    """Fixed before any run: a comparison takes the first so many of them."""
+    evaluation: Evaluation = Evaluation()
+    mini: Mini
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        ends = [stage.until for stage in self.stages]
+        if ends != sorted(set(ends)):
+            raise ValueError(f"stages: `until` must grow, got {ends}")
+        names = [stage.name for stage in self.stages]
+        if len(set(names)) < len(names):
+            raise ValueError(f"stages: names must differ, got {names}")
+        return self
+
+
+def plan_names() -> list[str]:
+    """Names of all plans."""
+    names = (entry.name for entry in resources.files("experiments").joinpath("plans").iterdir())
+    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
+
+
+def load_plan(name: str, scale: Scale) -> Plan:
+    """A plan at a scale.
+
+    Raises:
+        ConfigError: There is none of that name, or its file is wrong.
+    """
+    if name not in plan_names():
+        known = ", ".join(plan_names())
+        raise ConfigError(f"experiment: expected one of {known}, got {name!r}")
+    text = resources.files("experiments").joinpath("plans", f"{name}.toml").read_text("utf-8")
+    return read_plan(name, text, scale)
+
+
+def read_plan(name: str, text: str, scale: Scale) -> Plan:
+    """The same from the text of a file. Raises ConfigError."""
+    try:
+        plan = Plan.model_validate({"name": name, **tomllib.loads(text)})
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"plan {name}: expected TOML: {error}") from error
+    except ValidationError as error:
+        raise ConfigError(_one_line(f"plan {name}", error)) from error
+    if plan.preset:
+        plan = plan.model_copy(update={"config": merged(preset_tree(plan.preset), plan.config)})
+    plan = scaled(plan) if scale == "mini" else plan
+    for index in range(len(plan.stages)):
+        stage_config(plan, index, seed=1)
+    return plan
+
+
+def scaled(plan: Plan) -> Plan:
+    """The plan at mini scale."""
+    mini = plan.mini
+    stages = tuple(
+        stage.model_copy(
+            update={
+                "until": max(1, stage.until // mini.factor),
+                "config": _divided(stage.config, mini),
+                "changes": tuple(_earlier(change, mini.factor) for change in stage.changes),
+            }
+        )
+        for stage in plan.stages
+    )
+    every = max(1, plan.evaluation.every_actions // mini.factor)
+    return plan.model_copy(
+        update={
+            "stages": stages,
+            "config": merged(_divided(_with_defaults(plan.config), mini), mini.config),
+            "evaluation": plan.evaluation.model_copy(update={"every_actions": every}),
+        }
+    )
+
+
+def stage_config(plan: Plan, index: int, seed: int) -> Config:
+    """The whole configuration in force during a stage. Raises ConfigError."""
+    tree: Tree = {"run": {"name": plan.name, "seed": seed}}
+    for part in (plan.config, *(stage.config for stage in plan.stages[: index + 1])):
+        tree = merged(tree, part)
+    try:
+        return Config.model_validate(tree)
+    except ValidationError as error:
+        where = f"plan {plan.name}, stage {plan.stages[index].name}"
+        raise ConfigError(_one_line(where, error)) from error
+
+
+def merged(tree: Tree, over: Mapping[str, Any]) -> Tree:
+    """A tree of tables with another laid over it."""
+    result = dict(tree)
+    for key, value in over.items():
+        below = result.get(key)
+        both = isinstance(value, Mapping) and isinstance(below, Mapping)
+        result[key] = merged(dict(below), value) if both else value  # type: ignore[arg-type]
+    return result
+
+
+def _with_defaults(config: Tree) -> Tree:
+    """With the values that a smaller scale divides, where the plan leaves them at the default."""
+    defaults = Config().to_dict()
+    tables: Tree = {"learning": {}, "memory": {}}
+    for section, key in (*DIVIDED, ("learning", "mini_batches_per_episode")):
+        if key in defaults[section]:
+            tables[section][key] = defaults[section][key]
+    return merged(tables, config)
+
+
+def _divided(config: Tree, mini: Mini) -> Tree:
+    result = merged({}, config)
+    for section, key in DIVIDED:
+        if result.get(section, {}).get(key, 0) > 0:
+            value = max(1, result[section][key] // mini.factor)
+            result = merged(result, {section: {key: value}})
+    batches = result.get("learning", {}).get("mini_batches_per_episode")
+    if batches:
+        more = {"learning": {"mini_batches_per_episode": batches * mini.mini_batches}}
+        result = merged(result, more)
+    return result
+
+
+def _earlier(change: Tree, factor: int) -> Tree:
+    return {**change, "at_episode": max(1, int(change.get("at_episode", 1)) // factor)}
+
+
+def _one_line(where: str, error: ValidationError) -> str:
+    first = error.errors(include_url=False, include_context=False)[0]
+    key = ".".join(str(part) for part in first["loc"])
+    return f"{where}: {key}: {first['msg'].removeprefix('Value error, ')}"

@@ -1,0 +1,65 @@
+"""The record of one episode, and what proves that compared runs began alike."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+
+from experiments.records import Row
+from experiments.single_process import SingleProcess, TurnDone
+from shared.rl.policy import FORWARD, FORWARD_LEFT, FORWARD_RIGHT
+
+
+def episode_row(loop: SingleProcess, done: TurnDone, stage: str, seconds: float) -> Row:
+    """A row of `episodes.csv` (`records.EPISODE_COLUMNS`) about the turn just done."""
+    submitted, discarded = done.submitted, done.maintenance.discarded
+    counters, memory, trainer = loop.counters, loop.memory, loop.trainer
+    losses = [trained.loss for trained in done.trained if trained.loss is not None]
+    by_action = memory.by_action()
+    by_world = np.bincount(memory.rows["world"], minlength=len(memory.worlds))
+    counts = zip(memory.worlds, by_world, strict=True)
+    return {
+        "episode": done.commit.episode,
+        "stage": stage,
+        "world": submitted.worlds[-1] if submitted.worlds else "",
+        "ended": submitted.ended,
+        "bump": int(submitted.bump),
+        "fitness": submitted.fitness,
+        "actions": submitted.actions,
+        "total_actions": counters.actions,
+        "bumps": counters.bumps,
+        "laps_left": counters.laps_left,
+        "laps_right": counters.laps_right,
+        "longest_run_actions": counters.longest_run_actions,
+        "mini_batches": len(done.trained),
+        "loss": f"{float(np.mean(losses)):.6g}" if losses else "",
+        "fitting": int(any(trained.batches for trained in done.trained)),
+        "train_steps": trainer.train_steps,
+        "fits": trainer.fits,
+        "weights_version": trainer.version,
+        "target_age": done.commit.episode - trainer.episode_at_copy,
+        "memory": len(memory),
+        "capacity": memory.capacity,
+        "forward": by_action[FORWARD],
+        "left": by_action[FORWARD_LEFT],
+        "right": by_action[FORWARD_RIGHT],
+        "by_world": " ".join(f"{name}={count}" for name, count in counts),
+        "discarded": len(discarded.ids),
+        "last_resort": discarded.last_resort,
+        "recomputed": int(discarded.recomputed),
+        "equalised": int(done.maintenance.equalised),
+        "threshold_percent": discarded.threshold_percent,
+        "seconds": round(seconds, 2),
+    }
+
+
+def memory_hash(loop: SingleProcess, before: int) -> str:
+    """16 hex digits over what was stored before this insertion number: states and actions."""
+    memory = loop.memory
+    ranks = np.flatnonzero(memory.ids < before)
+    digest = hashlib.sha256()
+    for name in ("id", "action", "x_m", "y_m", "heading_rad"):
+        digest.update(np.ascontiguousarray(memory.rows[name][ranks]).tobytes())
+    digest.update(memory.images(ranks).tobytes())
+    return digest.hexdigest()[:16]

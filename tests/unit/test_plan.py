@@ -1,0 +1,154 @@
+"""Experiments as data: the thesis's constants, the small scale, and what is refused."""
+
+from __future__ import annotations
+
+import pytest
+
+from experiments.plan import SCALES, load_plan, merged, plan_names, read_plan, stage_config
+from shared.errors import ConfigError
+
+SMALL = """
+title = "t"
+source = "s"
+[[stages]]
+name = "a"
+until = 40
+[stages.config.memory]
+capacity = 400
+[[stages]]
+name = "b"
+until = 99
+[stages.config.learning]
+fit_every = 25
+mini_batches_per_episode = 2
+[mini]
+factor = 10
+mini_batches = 3
+[mini.config.network]
+filters = 16
+"""
+THESIS = {
+    # stage by stage: episodes, memory, strategy, mini-batches, fit every, highest threshold, world
+    "plus-normm": [(15000, 45000, "normm", 1, 0, 7, "plus")],
+    "plus-normm-fit": [(5000, 45000, "normm", 5, 100, 7, "plus")],
+    "plus-rmm": [
+        (1000, 2000, "normm", 1, 0, 7, "plus"),
+        (2000, 45000, "normm", 1, 0, 7, "plus"),
+        (2999, 45000, "rmm", 0, 0, 3, "plus"),
+        (7000, 45000, "rmm", 0, 100, 3, "plus"),
+    ],
+    "plus-rmm-nopretrain": [(5000, 45000, "rmm", 5, 100, 3, "plus")],
+    "plus-minus": [
+        (1500, 50000, "rmm", 0, 100, 5, "minus"),
+        (3000, 50000, "rmm", 0, 100, 5, "plus"),
+    ],
+    "policy-roulette": [(1000, 2000, "normm", 1, 0, 7, "plus")],
+    "policy-roulette-4000": [(4000, 2000, "normm", 1, 0, 7, "plus")],
+}
+
+
+@pytest.mark.parametrize("name", THESIS)
+def test_full_scale_has_the_constants_of_the_thesis(name: str) -> None:
+    """A38-A43."""
+    plan = load_plan(name, "full")
+    found = []
+    for index, stage in enumerate(plan.stages):
+        config = stage_config(plan, index, 1)
+        memory, learning = config.memory, config.learning
+        found.append(
+            (
+                stage.until,
+                memory.capacity,
+                memory.strategy,
+                learning.mini_batches_per_episode,
+                learning.fit_every,
+                memory.threshold_max_percent,
+                config.robot.world,
+            )
+        )
+        assert memory.equalise_every == 50
+        assert config.network.filters == 64
+        assert learning.learning_rate == 0.00025
+    assert found == THESIS[name]
+
+
+def test_only_the_policy_differs_between_compared_policies() -> None:
+    """A38: equal weights and memory at the beginning come from an equal seed."""
+    configs = [
+        stage_config(load_plan(f"policy-{kind}", "full"), 0, 1).to_dict()
+        for kind in ("eps-greedy", "roulette", "eps-greedy-roulette")
+    ]
+    kinds = [config["policy"].pop("kind") for config in configs]
+    for config in configs:
+        del config["run"]["name"]
+    assert kinds == ["eps-greedy", "roulette", "eps-greedy-roulette"]
+    assert configs[0] == configs[1] == configs[2]
+
+
+@pytest.mark.parametrize(
+    ("ours", "beside"),
+    [("plus-minus", "plus-minus-normm"), ("plus-rmm-nopretrain", "plus-normm-fit-alone")],
+)
+def test_only_the_strategy_differs_between_compared_memories(ours: str, beside: str) -> None:
+    trees = [stage_config(load_plan(name, "mini"), 0, 1).to_dict() for name in (ours, beside)]
+    for tree in trees:
+        for key in ("threshold_percent", "threshold_max_percent"):  # of RMM alone
+            del tree["memory"][key]
+        del tree["run"]["name"]
+    assert [tree["memory"].pop("strategy") for tree in trees] == ["rmm", "normm"]
+    assert trees[0] == trees[1]
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_every_plan_can_be_run_after_its_predecessor(scale: str) -> None:
+    for name in plan_names():
+        plan = load_plan(name, scale)  # type: ignore[arg-type]
+        assert plan.after in ("", *plan_names())
+        if plan.after:  # goes on with the same network and seeds
+            before = load_plan(plan.after, scale)  # type: ignore[arg-type]
+            assert stage_config(before, 0, 1).network == stage_config(plan, 0, 1).network
+            assert plan.seeds == before.seeds
+
+
+def test_mini_divides_sizes_and_periods_and_nothing_else() -> None:
+    plan = read_plan("small", SMALL, "mini")
+    first, second = (stage_config(plan, i, 1) for i in (0, 1))
+    assert [stage.until for stage in plan.stages] == [4, 9]
+    assert (first.memory.capacity, first.memory.equalise_every) == (40, 5)
+    assert (first.learning.fit_every, second.learning.fit_every) == (10, 2)
+    assert first.learning.mini_batches_per_episode == 3  # of 1, the default
+    assert second.learning.mini_batches_per_episode == 6
+    assert second.memory.capacity == 40  # kept from the stage before
+    full = stage_config(read_plan("small", SMALL, "full"), 1, 1)
+    assert full.learning.mini_batches_per_episode == 2
+    assert full.network.filters == 64
+
+
+def test_merging_changes_neither_tree() -> None:
+    below, over = {"a": {"b": 1, "c": 2}}, {"a": {"b": 3}}
+    assert merged(below, over) == {"a": {"b": 3, "c": 2}}
+    assert (below, over) == ({"a": {"b": 1, "c": 2}}, {"a": {"b": 3}})
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (("until = 99", "until = 40"), "`until` must grow"),
+        (('name = "b"', 'name = "a"'), "names must differ"),
+        (("capacity = 400", 'capacity = "many"'), "stage a: memory.capacity"),
+        (("fit_every = 25", "fit_evry = 25"), "stage b: learning.fit_evry"),
+        (("factor = 10", "factor = 0"), "mini.factor"),
+        (('title = "t"', ""), "title"),
+        (("[[stages]]", "[[stages"), "expected TOML"),
+    ],
+)
+def test_a_wrong_plan_is_refused_in_one_line(change: tuple[str, str], complaint: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        read_plan("small", SMALL.replace(*change), "full")
+    assert complaint in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_plan_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(ConfigError, match="plus-rmm"):
+        load_plan("plus-rnm", "mini")
