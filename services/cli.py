@@ -389,6 +389,39 @@ def report(
     typer.echo(f"written: {pages[0]} and {len(pages) - 1} Markdown pages beside it")
 
 
+# ---------------------------------------------------------------- experiments
+
+
+@app.command()
+def evaluate(
+    run: Annotated[
+        Path,
+        typer.Argument(metavar="RUN", help="Folder of a run, or a .safetensors file of weights."),
+    ],
+    world: Annotated[
+        str | None, typer.Option(help="Where to drive; default: the run's world.")
+    ] = None,
+    starts: Annotated[int, typer.Option(help="Number of drives.", min=1, max=1000)] = 16,
+    actions: Annotated[int, typer.Option(help="Of each drive.", min=1, max=100_000)] = 400,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the results; default: evaluation-WORLD.")
+    ] = None,
+    config: ConfigFile = None,
+    set_: Set = None,
+) -> None:
+    """Drive with a run's network, frozen, beside random actions and the planner.
+
+    The run's own config.toml tells robot and network; --config and --set stand in for a missing one
+    or change it.
+    """
+    command = import_role("experiments.evaluate", "experiments")
+    file = config or command.configuration_of(run)
+    loaded = _load(None, file, set_, others={"robot.world": world})
+    folder = out or Path(f"evaluation-{loaded.robot.world}")
+    command.run(run, loaded, starts, actions, folder)
+    typer.echo(f"written to {folder}")
+
+
 # ---------------------------------------------------------------- shared by the commands
 
 

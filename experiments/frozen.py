@@ -1,0 +1,83 @@
+"""Networks that a run left behind, for driving without learning."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as save_safetensors
+
+from shared.config import ActorNumerics, NetworkConfig
+from shared.errors import ConfigError, StateError
+from shared.rl.predictor import Predictor
+
+CHECKPOINT = Path("learner") / "checkpoint.safetensors"
+WEIGHTS = Path("weights.safetensors")
+TARGET = "target."
+"""Tensors of the network that acts begin with this in a checkpoint (A26)."""
+
+
+@dataclass(frozen=True)
+class Frozen:
+    """A network's parameters, and how far it had learnt as far as its file tells."""
+
+    path: Path
+    data: bytes
+    """As safetensors: the parameters of the target network alone."""
+    episode: int | None = None
+    train_steps: int | None = None
+
+    def predictor(self, network: NetworkConfig) -> Predictor:
+        """The network ready to predict, with the same arithmetic wherever and whatever it learnt.
+
+        Raises:
+            ConfigError: It is not of this shape.
+        """
+        predictor = Predictor(network, ActorNumerics())
+        try:
+            predictor.load(0, self.data)
+        except ValueError as error:
+            raise ConfigError(
+                f"{self.path}: not a network with network.filters = {network.filters}: {error}"
+            ) from error
+        return predictor
+
+
+def find(run: Path) -> Path:
+    """The file with the network of a run: its folder, or the file itself.
+
+    Raises:
+        ConfigError: There is none.
+    """
+    if run.is_file():
+        return run
+    for name in (CHECKPOINT, WEIGHTS):
+        if (run / name).is_file():
+            return run / name
+    if not run.exists():
+        raise ConfigError(f"run {run}: there is no such folder or file")
+    raise ConfigError(f"run {run}: expected {CHECKPOINT} or {WEIGHTS} in it, found neither")
+
+
+def read(path: Path) -> Frozen:
+    """Read a checkpoint of the learner, or a file of weights.
+
+    Raises:
+        StateError: It is damaged.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            state = json.loads((file.metadata() or {}).get("state", "{}"))
+            names = list(file.keys())
+            prefix = TARGET if any(name.startswith(TARGET) for name in names) else ""
+            tensors = {
+                name.removeprefix(prefix): file.get_tensor(name).contiguous()
+                for name in names
+                if name.startswith(prefix)
+            }
+    except (OSError, SafetensorError, ValueError) as error:
+        raise StateError(f"{path}: damaged weights: {error}") from error
+    steps = state.get("counters", {}).get("train_steps")
+    return Frozen(path, save_safetensors(tensors), state.get("episode"), steps)
