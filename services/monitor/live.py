@@ -248,7 +248,7 @@ def _learner_rows(learner: LearnerState) -> Iterator[tuple[RenderableType, ...]]
 def _robot_row(
     name: str, robot: RobotState | None, actor: ActorState | None
 ) -> tuple[RenderableType, ...]:
-    state = robot.state if robot else "unknown"
+    state = f"{robot.state} in {robot.world}" if robot else "unknown"
     if actor is None:
         return f"robot {name}", state, "no actor yet"
     values = " ".join(f"{value:+.2f}" for value in actor.values)

@@ -129,6 +129,8 @@ def _facts(snapshot: Snapshot) -> list[tuple[str, str]]:
         r = robot.message
         text = f"{r.state} in {r.world}, action {r.sequence}, bumps {r.bumps}, "
         text += f"laps {r.laps_left} left {r.laps_right} right"
+        if r.pending_changes:
+            text += f", changes of the world waiting {r.pending_changes}"
         rows.append((f"robot {name}", text))
     for name, actor in snapshot.actors.items():
         a = actor.message

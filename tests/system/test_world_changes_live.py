@@ -84,7 +84,9 @@ def test_commands_change_the_world_and_what_crosses_is_dropped_and_counted(
         life = watch.state().life
         wait_until(lambda: watch.state().life != life, 30, "the new driver")
         assert (watch.state().world, watch.state().pending_changes) == ("minus", 1)
-        assert "minus" in corridor("status", "--json")
+        told = " ".join(corridor("status").split())
+        assert "in minus, action" in told
+        assert "changes of the world waiting 1" in told
         learner = cluster.learner()
         assert learner is not None
         cluster.wait_episodes(learner.episode + 2, 60)

@@ -26,7 +26,7 @@ LEARNER = message(
     fit_batch=45, fit_batches=180, loss=0.01234, train_steps=540, fits=2,
 )  # fmt: skip
 ACTOR = message(ActorState, robot="r1", phase="driving", step=17, actions_per_s=21.34)
-ROBOT = message(RobotState, robot="r1", state="driving")
+ROBOT = message(RobotState, robot="r1", state="driving", world="minus")
 
 
 def view(**given: Any) -> View:
@@ -74,7 +74,8 @@ def test_the_panel_tells_everything() -> None:
         "run demo", "1:02:05", "137 of 200", "fitness 38.2", "120", "laps 3 left, 2 right",
         "12345", "21.3 per second", "4321 of 6000", "forward 2000  left 1200  right 1121",
         "threshold 1 bit of 120", "weights version 42", "540 training steps", "2 fitting phases",
-        "loss 0.01234", "fitting, epoch 2, 25 %", "robot r1", "driving", "step 17", "Ctrl-C",
+        "loss 0.01234", "fitting, epoch 2, 25 %", "robot r1", "driving in minus", "step 17",
+        "Ctrl-C",
     ):  # fmt: skip
         assert part in shown, part
     assert "━" in shown  # the bars
