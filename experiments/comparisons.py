@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 from experiments import findings
 from experiments.document import Block, Findings, Missing, Picture, Section, Table
 from experiments.figures import evaluation, probes, progress
-from experiments.figures.style import png
 from experiments.measures import Kept, compare, kept, max_mean_fitness, number, of_seeds, spread
 from experiments.runs import Experiment
 
@@ -76,8 +76,8 @@ def _continued(named: Named) -> list[Block]:
         return blocks
     before, after = (named[name] for name in needed)
     caption = "Fitness. Red line: where fitting phases and five mini-batches per episode begin."
-    drawn = progress.continued(before, after)
-    picture = Picture(f"{before.scale}-fits", what, caption, png(drawn))
+    drawn = partial(progress.continued, before, after)
+    picture = Picture(f"{before.scale}-fits", what, caption, drawn)
     return [picture, *_sentences(findings.continued(before, after))]
 
 
@@ -99,7 +99,7 @@ def _fitted(named: Named) -> list[Block]:
         return blocks
     shown = [named[name] for name in needed]
     caption = "Fitness; bands: lowest to highest seed. Episodes are counted as in every run."
-    picture = Picture(f"{shown[0].scale}-rmm", what, caption, png(progress.compared(shown)))
+    picture = Picture(f"{shown[0].scale}-rmm", what, caption, partial(progress.compared, shown))
     return [picture, *_sentences(findings.fitted(shown[:2], shown[2]))]
 
 
@@ -131,19 +131,19 @@ def _together(group: str, shown: Sequence[Experiment]) -> list[Block]:
     blocks: list[Block] = []
     for world in sorted(set.intersection(*(set(e.worlds) for e in shown))):
         caption = "Greedy drives without learning; bands: lowest to highest seed."
-        drawn = evaluation.curves(shown, world)
+        drawn = partial(evaluation.curves, shown, world)
         title = f"Frozen evaluation in {world}, {', '.join(e.name for e in shown)}"
         name = f"{scale}-evaluation-{group}-in-{world}"
-        blocks.append(Picture(name, title, caption, png(drawn)))
+        blocks.append(Picture(name, title, caption, drawn))
     pairs, refused = compare(shown)
     if pairs:
         caption = (
             "Difference of mean bumps per 1,000 actions of the newest frozen drives; bootstrap "
             "over seeds, 95 % interval. Filled: it excludes 0. With few seeds it is rough."
         )
-        drawn = evaluation.differences(pairs)
+        drawn = partial(evaluation.differences, pairs)
         name = f"{scale}-differences-{group}"
-        blocks.append(Picture(name, "Differences between experiments", caption, png(drawn)))
+        blocks.append(Picture(name, "Differences between experiments", caption, drawn))
         blocks.append(Findings(tuple(findings.difference(pair) for pair in pairs)))
     return [*blocks, *(Missing("difference of bumps", line) for line in refused)]
 
@@ -170,8 +170,8 @@ def _predictions(
         f"Upper bars: {our_weights} weights of {ours}, seed {first.seed}; lower bars: "
         f"{their_weights} weights of {theirs}, seed {second.seed}. From −1 to 1."
     )
-    drawn = probes.predictions(first.probes, networks, PROBES_SHOWN)
-    return [Picture(f"{named[ours].scale}-probes-{ours}-{theirs}", what, caption, png(drawn))]
+    drawn = partial(probes.predictions, first.probes, networks, PROBES_SHOWN)
+    return [Picture(f"{named[ours].scale}-probes-{ours}-{theirs}", what, caption, drawn)]
 
 
 def _kept(named: Named) -> list[Block]:

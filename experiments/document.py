@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from jinja2 import Environment
+from matplotlib.figure import Figure
+
+from experiments.figures.style import png
 
 
 @dataclass(frozen=True)
@@ -18,8 +22,12 @@ class Picture:
     """File name without ending; unique in a document."""
     title: str
     caption: str
-    image: bytes
-    """PNG."""
+    draw: Callable[[], Figure]
+
+    @cached_property
+    def image(self) -> bytes:
+        """PNG, drawn when first asked for: text alone needs no drawing."""
+        return png(self.draw())
 
 
 @dataclass(frozen=True)

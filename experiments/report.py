@@ -6,7 +6,8 @@ the comparisons. A figure whose data are not there is left out with a line sayin
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -25,7 +26,7 @@ from experiments.document import (
     write_pictures,
 )
 from experiments.figures import evaluation, memory, probes, progress, route
-from experiments.figures.style import png, stages_text
+from experiments.figures.style import stages_text
 from experiments.measures import MEASURED, evaluated, number, of_seeds, spread
 from experiments.runs import Experiment, Run
 from services.robot_driver.world import World, WorldError, load_world
@@ -40,7 +41,7 @@ THESIS_FIGURES = {
     ("plus-normm", "fitness"): "Fig 4.4a",
     ("plus-normm", "loss"): "Fig 4.4b",
     ("plus-normm", "memory"): "Fig 4.6",
-    ("plus-normm", "probes-best"): "Fig 4.7",
+    ("plus-normm", "probes-best-plus"): "Fig 4.7",
     ("plus-rmm", "fitness"): "Fig 4.9a",
     ("plus-rmm", "loss"): "Fig 4.9b",
     ("plus-rmm", "memory"): "Fig 4.11",
@@ -148,10 +149,12 @@ def section_of(experiment: Experiment) -> Section:
     return Section(experiment.full_name, title, tuple(blocks))
 
 
-def _picture(experiment: Experiment, kind: str, title: str, caption: str, drawn: Figure) -> Picture:
+def _picture(
+    experiment: Experiment, kind: str, title: str, caption: str, drawn: Callable[[], Figure]
+) -> Picture:
     theirs = THESIS_FIGURES.get((experiment.name, kind))
     shown = f"{title} ({theirs})" if theirs else title
-    return Picture(f"{experiment.full_name}-{kind}", shown, caption, png(drawn))
+    return Picture(f"{experiment.full_name}-{kind}", shown, caption, drawn)
 
 
 def _seeds_text(experiment: Experiment) -> str:
@@ -187,13 +190,13 @@ def _progress(experiment: Experiment) -> list[Block]:
     if window != runs.WINDOW:
         about += f" The thesis averages {runs.WINDOW}; this run is 1/{experiment.first.factor:g}."
     caption = f"{about} {_seeds_text(experiment)} {stages}"
-    drawn = progress.fitness(experiment)
+    drawn = partial(progress.fitness, experiment)
     blocks: list[Block] = [_picture(experiment, "fitness", "Fitness", caption, drawn)]
     blocks.append(Findings(tuple(findings.fitness(experiment))))
     if not any(len(progress.curve_of(run, "loss")[0]) for run in experiment.runs):
         return [*blocks, Missing("loss over episodes", "nothing was trained")]
     caption = f"Loss, averaged over {window} episodes. {_seeds_text(experiment)} {stages}"
-    blocks.append(_picture(experiment, "loss", "Loss", caption, progress.loss(experiment)))
+    blocks.append(_picture(experiment, "loss", "Loss", caption, partial(progress.loss, experiment)))
     return [*blocks, *_sentences(findings.loss(experiment))]
 
 
@@ -204,14 +207,14 @@ def _sentences(sentences: Sequence[str]) -> list[Block]:
 def _memory(experiment: Experiment) -> list[Block]:
     if not all(len(run.episodes) for run in experiment.runs):
         return [Missing("samples in the memory", "a seed has no episodes yet")]
-    drawn = memory.by_action(experiment)
+    drawn = partial(memory.by_action, experiment)
     caption = f"Samples in the replay memory by action. {_seeds_text(experiment)}"
     blocks: list[Block] = [_picture(experiment, "memory", "Memory by action", caption, drawn)]
     blocks += _sentences(findings.memory(experiment))
     several = any(len(run.samples_by_world) > 1 for run in experiment.runs)
     if several:
         caption = f"Samples in the replay memory by corridor. {_seeds_text(experiment)}"
-        drawn = memory.by_world(experiment)
+        drawn = partial(memory.by_world, experiment)
         blocks.append(_picture(experiment, "worlds", "Memory by corridor", caption, drawn))
         blocks += _sentences(findings.worlds_in_memory(experiment))
     elif (experiment.name, "worlds") in THESIS_FIGURES:
@@ -230,7 +233,7 @@ def _evaluations(experiment: Experiment) -> list[Block]:
             "the map, where they drove."
         )
         title = f"Frozen evaluation in {world}"
-        drawn = evaluation.curves([experiment], world)
+        drawn = partial(evaluation.curves, [experiment], world)
         blocks.append(_picture(experiment, f"evaluation-{world}", title, caption, drawn))
         blocks += _sentences(findings.evaluation(experiment, world))
     return blocks
@@ -249,8 +252,11 @@ def _probes(experiment: Experiment) -> list[Block]:
         if choice is None:
             continue
         weights = "best" if prefix == "best" else "last"
-        drawn = probes.predictions(
-            choice.probes, [probes.Predictions("reward", choice.probes.values)], PROBES_SHOWN
+        drawn = partial(
+            probes.predictions,
+            choice.probes,
+            [probes.Predictions("reward", choice.probes.values)],
+            PROBES_SHOWN,
         )
         caption = (
             f"Images of the set {choice.probes.set_name}, and the rewards that the {weights} "
@@ -258,8 +264,6 @@ def _probes(experiment: Experiment) -> list[Block]:
         )
         title = f"Predicted rewards in {world}, {weights} weights"
         kind = f"probes-{prefix}-{world}"
-        if (experiment.name, f"probes-{prefix}") in THESIS_FIGURES:
-            title += f" ({THESIS_FIGURES[experiment.name, f'probes-{prefix}']})"
         blocks.append(_picture(experiment, kind, title, caption, drawn))
     return blocks or [Missing("predicted rewards", "there is no probes-best or probes-end file")]
 
@@ -274,7 +278,7 @@ def _routes(experiment: Experiment) -> list[Block]:
             title = f"Route in {drive.world}"
             if theirs := THESIS_FIGURES.get((experiment.name, "route")):
                 title += f" ({theirs})"
-            drawn = route.route(drive, _world(drive.world, run.folder))
+            drawn = partial(route.route, drive, _world(drive.world, run.folder))
             kind = f"route-{drive.label}-{run.info.seed}"
             blocks.append(_picture(experiment, kind, title, caption, drawn))
     if not blocks and (experiment.name, "route") in THESIS_FIGURES:
