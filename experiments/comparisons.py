@@ -98,7 +98,10 @@ def _fitted(named: Named) -> list[Block]:
     if blocks := _absent(what, named, needed):
         return blocks
     shown = [named[name] for name in needed]
-    caption = "Fitness; bands: lowest to highest seed. Episodes are counted as in every run."
+    caption = (
+        "Fitness; bands: lowest to highest seed. Episodes are counted from each run's first; "
+        "plus-normm-fit goes on from plus-normm, the others begin anew."
+    )
     picture = Picture(f"{shown[0].scale}-rmm", what, caption, partial(progress.compared, shown))
     return [picture, *_sentences(findings.fitted(shown[:2], shown[2]))]
 

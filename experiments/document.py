@@ -117,11 +117,16 @@ def _cell(text: str) -> str:
 def html(title: str, sections: Sequence[Section]) -> str:
     """One page that needs no other file: pictures and style are inside."""
     template = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(_PAGE)
-    return template.render(title=title, sections=sections, kind=_kind, data=_data)
+    return template.render(title=title, sections=sections, kind=_kind, code=_is_code, data=_data)
 
 
 def _kind(block: Block) -> str:
     return type(block).__name__.lower()
+
+
+def _is_code(cell: str) -> bool:
+    """Whether it stands between backticks, as code does in Markdown."""
+    return len(cell) > 1 and cell[0] == cell[-1] == "`"
 
 
 def _data(picture: Picture) -> str:
@@ -136,7 +141,7 @@ _PAGE = """<!DOCTYPE html>
 <title>{{ title }}</title>
 <style>
 body { font: 16px/1.5 system-ui, sans-serif; color: #222; background: #fff;
-       max-width: 54rem; margin: 2rem auto; padding: 0 1rem; }
+       max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
 h1, h2 { line-height: 1.2; }
 h2 { margin-top: 3rem; border-top: 1px solid #ddd; padding-top: 1rem; }
 figure { margin: 1.5rem 0; }
@@ -170,7 +175,15 @@ th, td { text-align: left; padding: 0.2rem 0.7rem 0.2rem 0; border-bottom: 1px s
 <caption>{{ block.title }}</caption>
 <tr>{% for cell in block.header %}<th>{{ cell }}</th>{% endfor %}</tr>
 {% for row in block.rows %}
-<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
+<tr>
+{% for cell in row %}
+{% if code(cell) %}
+<td><code>{{ cell.strip("`") }}</code></td>
+{% else %}
+<td>{{ cell }}</td>
+{% endif %}
+{% endfor %}
+</tr>
 {% endfor %}
 </table></div>
 {% elif kind(block) == "findings" %}

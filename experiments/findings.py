@@ -141,12 +141,13 @@ def evaluation(experiment: Experiment, world: str) -> list[str]:
     bumps = of_seeds(experiment, evaluated("bumps_per_1000", world))
     if not len(bumps):
         return []
-    laps, distance, circling = (
+    laps, distance, coverage, circling = (
         of_seeds(experiment, evaluated(column, world))
-        for column in ("laps", "distance", "circling")
+        for column in ("laps", "distance", "coverage", "circling")
     )
     told = f"Frozen in {world}: {spread(bumps)} bumps and {spread(laps)} laps per 1,000 actions, "
-    told += f"on average {spread(distance)} of the farthest possible from 50 actions ago"
+    told += f"on average {spread(distance)} of the farthest possible from 50 actions ago, "
+    told += f"{spread(coverage)} of the corridor visited"
     for driver in ("random", "planner"):
         other = of_seeds(experiment, evaluated("bumps_per_1000", world, driver))
         if len(other):

@@ -38,6 +38,14 @@ def max_mean_fitness(run: Run) -> float:
     return float(np.max(curve_of(run, "fitness")[1], initial=-math.inf))
 
 
+def longest_run_episode(run: Run) -> float:
+    """Episode in which the longest way without a bump got its full length."""
+    lengths = run.episodes.numbers("longest_run_actions")
+    if not np.any(~np.isnan(lengths)):
+        return MISSING
+    return float(run.episodes.numbers("episode")[np.nanargmax(lengths)])
+
+
 def actions_per_episode(run: Run) -> float:
     """Mean of all episodes."""
     return run.info.actions / run.info.episodes if run.info.episodes else MISSING
@@ -52,6 +60,9 @@ MEASURED = {
     ),
     "longest_run": Measure(
         "most actions without a bump", lambda run: _highest(run, "longest_run_actions"), scales=True
+    ),
+    "longest_run_episode": Measure(
+        "episode of the longest way without a bump", longest_run_episode, scales=True
     ),
     "max_mean_fitness": Measure("highest mean fitness", max_mean_fitness, scales=False),
     "max_threshold_percent": Measure(

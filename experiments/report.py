@@ -73,11 +73,12 @@ def write(folders: Sequence[Path], out: Path, gpu_step_ms: float | None = None) 
     overview = Section("runs", "All runs", overview_blocks(experiments, gpu_step_ms))
     parts = [section_of(experiment) for experiment in experiments]
     compared = compare_all(experiments)
-    write_pictures([*parts, *compared], out / "figures")
+    sections = [overview, *compared, *parts]
+    write_pictures(sections, out / "figures")
     page = out / "report.html"
-    page.write_text(html(TITLE, [overview, *parts, *compared]), encoding="utf-8")
+    page.write_text(html(TITLE, sections), encoding="utf-8")
     written = [page]
-    for section in [overview, *parts, *compared]:
+    for section in sections:
         path = out / f"{section.name}.md"
         path.write_text(markdown([section], "figures", level=1), encoding="utf-8")
         written.append(path)
@@ -88,31 +89,40 @@ def overview_blocks(
     experiments: Sequence[Experiment], gpu_step_ms: float | None = None
 ) -> tuple[Block, ...]:
     """Everything that was run, and what it cost."""
-    everything = Table(
-        "Everything run; evaluations are the newest of the frozen network",
-        ("experiment", "scale", "seed", "complete", "seconds", "actions", "episodes",
-         "gradient steps", "evaluated in: bumps, laps per 1,000 actions, distance",
-         "command", "machine", "commit"),
-        tuple(_run_row(run) for experiment in experiments for run in experiment.runs),
+    every = [run for experiment in experiments for run in experiment.runs]
+    names = ("experiment", "scale", "seed")
+    numbers = Table(
+        "Everything run, and the newest drives of the frozen network",
+        (*names, "seconds", "actions", "episodes", "gradient steps", "frozen in",
+         "bumps per 1,000", "laps per 1,000", "distance"),
+        tuple(row for run in every for row in _number_rows(run)),
     )  # fmt: skip
-    return (everything, _costs(experiments, gpu_step_ms))
-
-
-def _run_row(run: Run) -> tuple[str, ...]:
-    info = run.info
-    worlds = dict.fromkeys(run.evaluations.where(driver="network").words("world"))
-    told = (
-        f"{world}: "
-        + ", ".join(
-            number(evaluated(c, world)(run)) for c in ("bumps_per_1000", "laps", "distance")
-        )
-        for world in worlds
+    origins = Table(
+        "How it was run",
+        (*names, "complete", "command", "machine", "commit"),
+        tuple(_origin_row(run) for run in every),
     )
-    return (
-        info.experiment, info.scale, str(info.seed), "yes" if info.complete else "no",
-        f"{info.seconds:,.0f}", f"{info.actions:,}", f"{info.episodes:,}", f"{info.train_steps:,}",
-        "; ".join(told) or "-", f"`{info.command}`", info.machine, f"`{info.commit}`",
-    )  # fmt: skip
+    return (numbers, _costs(experiments, gpu_step_ms), origins)
+
+
+def _number_rows(run: Run) -> list[tuple[str, ...]]:
+    """One row per corridor driven in frozen, the run's own numbers in the first only."""
+    info = run.info
+    own = (f"{info.seconds:,.0f}", f"{info.actions:,}", f"{info.episodes:,}",
+           f"{info.train_steps:,}")  # fmt: skip
+    worlds = dict.fromkeys(run.evaluations.where(driver="network").words("world")) or ["-"]
+    rows = []
+    for world in worlds:
+        figures = tuple(number(evaluated(column, world)(run)) for column in EVALUATED)
+        rows.append((info.experiment, info.scale, str(info.seed), *own, world, *figures))
+        own = ("", "", "", "")
+    return rows
+
+
+def _origin_row(run: Run) -> tuple[str, ...]:
+    info = run.info
+    return (info.experiment, info.scale, str(info.seed), "yes" if info.complete else "no",
+            f"`{info.command}`", info.machine, f"`{info.commit}`")  # fmt: skip
 
 
 def _costs(experiments: Sequence[Experiment], gpu_step_ms: float | None) -> Table:

@@ -105,6 +105,11 @@ def with_gaps(band: Band, longest: float) -> Band:
     return Band(np.insert(band.x, after, middles), low, median, high, band.seeds)
 
 
+def from_the_start(band: Band, first: float) -> Band:
+    """The same band with places counted from 1 at `first`."""
+    return Band(band.x - first + 1.0, band.low, band.median, band.high, band.seeds)
+
+
 def bootstrap_difference(
     ours: Floats, theirs: Floats, draw: np.random.Generator, resamples: int = RESAMPLES
 ) -> Difference:

@@ -145,13 +145,14 @@ def _evaluations(shape: Shape, episodes: list[Row], draw: np.random.Generator) -
 def _evaluation(
     label: str, driver: str, stage: str, at: Row, world: str, bumps_per_1000: float
 ) -> Row:
+    laps = 0.0 if world == "minus" else 4 / (1 + bumps_per_1000 / 10)
     return {
         "label": label, "driver": driver, "stage": stage, "episode": at["episode"],
         "total_actions": at["total_actions"], "train_steps": at["train_steps"], "world": world,
         "actions": 6400, "bumps": round(6.4 * bumps_per_1000), "bumps_per_1000": bumps_per_1000,
         "bumps_per_100m": 2 * bumps_per_1000, "mean_run": 1000 / bumps_per_1000,
         "longest_run": 400, "fitness": min(500.0, 1000 / bumps_per_1000),
-        "laps_left_per_1000": 4 / (1 + bumps_per_1000 / 10), "laps_right_per_1000": 0.5,
+        "laps_left_per_1000": laps, "laps_right_per_1000": laps / 8,
         "distance": 0.8 / (1 + bumps_per_1000 / 40), "coverage": 0.6, "circling": 0.02,
         "seconds": at["seconds"],
     }  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,18 +31,36 @@ def _distance(rows: Rows) -> Floats:
     return rows.numbers("distance")
 
 
-PANELS = (
-    ("bumps per 1,000 actions", _bumps),
-    ("laps per 1,000 actions", laps),
-    ("way from 50 actions ago\n(1: the farthest possible)", _distance),
-)
+def _coverage(rows: Rows) -> Floats:
+    return rows.numbers("coverage")
 
 
-def evaluation_band(experiment: Experiment, world: str, panel: int) -> Band | None:
+@dataclass(frozen=True)
+class Panel:
+    """One of the figures side by side."""
+
+    title: str
+    of: Callable[[Rows], Floats]
+    logarithmic: bool = False
+
+
+BUMPS = Panel("bumps per 1,000 actions", _bumps, logarithmic=True)
+LAPS = Panel("laps per 1,000 actions", laps)
+COVERAGE = Panel("part of the corridor visited", _coverage)
+DISTANCE = Panel("way from 50 actions ago\n(1: the farthest possible)", _distance)
+
+
+def panels(experiments: Sequence[Experiment], world: str) -> tuple[Panel, Panel, Panel]:
+    """Bumps, whether it gets around, and how far: coverage where nobody drove a lap."""
+    rows = [run.evaluations.where(world=world) for e in experiments for run in e.runs]
+    around = LAPS if any(np.any(laps(part) > 0) for part in rows) else COVERAGE
+    return BUMPS, around, DISTANCE
+
+
+def evaluation_band(experiment: Experiment, world: str, panel: Panel) -> Band | None:
     """One figure of all seeds over the actions driven while learning; None without drives."""
-    _, figure_of = PANELS[panel]
     rows = [run.evaluated(world) for run in experiment.runs]
-    curves = [(part.numbers("total_actions"), figure_of(part)) for part in rows if len(part)]
+    curves = [(part.numbers("total_actions"), panel.of(part)) for part in rows if len(part)]
     return band_between([_unique(*curve) for curve in curves]) if curves else None
 
 
@@ -52,25 +70,24 @@ def _unique(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     return x[last], y[last]
 
 
-def reference(experiments: Sequence[Experiment], driver: str, world: str, panel: int) -> float:
+def reference(experiments: Sequence[Experiment], driver: str, world: str, panel: Panel) -> float:
     """Median over all seeds of what a driver without a network reaches; NaN if none drove."""
-    _, figure_of = PANELS[panel]
     values = [
         value
         for experiment in experiments
         for run in experiment.runs
-        for value in figure_of(run.evaluations.where(driver=driver, world=world))
+        for value in panel.of(run.evaluations.where(driver=driver, world=world))
     ]
     return float(np.median(values)) if values else float("nan")
 
 
 @styled
 def curves(experiments: Sequence[Experiment], world: str) -> Figure:
-    """Bumps, laps and distance of frozen greedy drives in one corridor."""
+    """Bumps, laps or coverage, and distance of frozen greedy drives in one corridor."""
     figure = sheet(2.75 + 0.2 * (len(experiments) // 3))
     named = colours(experiment.name for experiment in experiments)
-    row = figure.subplots(1, len(PANELS))
-    for panel, axes in enumerate(row):
+    row = figure.subplots(1, 3)
+    for panel, axes in zip(panels(experiments, world), row, strict=True):
         for experiment in experiments:
             band = evaluation_band(experiment, world, panel)
             if band is not None:
@@ -84,12 +101,15 @@ def curves(experiments: Sequence[Experiment], world: str) -> Figure:
     return figure
 
 
-def _panel(axes: Axes, panel: int) -> None:
-    title, _ = PANELS[panel]
-    axes.set_title(title)
+def _panel(axes: Axes, panel: Panel) -> None:
+    axes.set_title(panel.title)
     axes.set_xlabel("actions driven while learning")
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.xaxis.set_major_locator(MaxNLocator(4))
+    if panel.logarithmic:  # linear from 0 to 1: good networks stay apart, none is left out
+        axes.set_yscale("symlog", linthresh=1.0)
+        axes.set_yticks([0, 1, 3, 10, 30, 100], ["0", "1", "3", "10", "30", "100"])
+        axes.minorticks_off()
     axes.set_ylim(bottom=0)
 
 

@@ -19,7 +19,14 @@ from experiments.figures.style import (
     styled,
 )
 from experiments.runs import Experiment, Run
-from experiments.statistics import Band, Curve, band_of_blocks, block_means, with_gaps
+from experiments.statistics import (
+    Band,
+    Curve,
+    band_of_blocks,
+    block_means,
+    from_the_start,
+    with_gaps,
+)
 
 FULL = 500
 """Highest fitness of an episode (A37)."""
@@ -120,14 +127,18 @@ def continued(before: Experiment, after: Experiment) -> Figure:
 
 @styled
 def compared(experiments: Sequence[Experiment]) -> Figure:
-    """Fitness of several experiments over the same episodes (Fig 4.12)."""
+    """Fitness of several experiments over their own episodes, each from 1 (Fig 4.12)."""
     figure = sheet(3.1)
     axes = figure.subplots()
     named = colours(experiment.name for experiment in experiments)
-    bands = [band_of(experiment, "fitness") for experiment in experiments]
+    bands = [
+        from_the_start(band_of(e, "fitness"), e.runs[0].episodes.numbers("episode")[0])
+        for e in experiments
+    ]
     for experiment, band in zip(experiments, bands, strict=True):
         draw_band(axes, band, named[experiment.name], experiment.name)
     _mean_labels(axes, bands, experiments[0].runs[0].window)
+    axes.set_xlabel("episode of the run")
     legend_below(axes, 3)
     return figure
 

@@ -22,14 +22,14 @@ WIDTH_IN = 6.5
 DPI = 130
 INK, GREY, SWITCH = "#222222", "#8a8a8a", "#c1272d"
 GREEN = "#009E73"
-OTHERS = ("#000000", "#7a5195", "#8c564b", "#6b8e23", "#c44e94", "#4d4d9a")
+OTHERS = ("#000000", "#7a5195", "#8c564b", "#6b8e23", "#44aa99", "#4d4d9a")
 """Colours of experiments without one of their own, by the order of their names."""
 EXPERIMENTS = {
     "plus-normm": "#D55E00",
     "plus-normm-fit": "#CC79A7",
     "plus-rmm": "#0072B2",
     "plus-rmm-nopretrain": "#56B4E9",
-    "plus-minus": "#009E73",
+    "plus-minus": "#882255",
     "i16c": "#E69F00",
 }
 ACTIONS = ("forward", "left", "right")

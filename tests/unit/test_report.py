@@ -12,10 +12,11 @@ import pytest
 from experiments import findings, report
 from experiments.comparisons import compare_all
 from experiments.document import Findings, Missing, Picture, Section, Table, html, markdown
-from experiments.figures.evaluation import Compared
+from experiments.figures.evaluation import BUMPS, COVERAGE, DISTANCE, LAPS, Compared, panels
 from experiments.figures.probes import chosen
 from experiments.measures import kept, number, spread
-from experiments.runs import Experiment, load
+from experiments.records import EVALUATION_COLUMNS, write_csv
+from experiments.runs import Experiment, load, read_run
 from experiments.statistics import Difference
 from services.cli import main
 from tests.synthetic_runs import write_probes, write_route, write_run
@@ -67,6 +68,23 @@ def test_two_corridors_show_their_samples_and_predictions(tmp_path: Path) -> Non
     assert "Memory by corridor (Fig 4.15)" in titles(section)
     assert "Predicted rewards in minus, last weights (Fig 4.17)" in titles(section)
     assert "more of Minus than of Plus, as in the thesis" in sentences(section)
+
+
+def test_coverage_stands_where_no_lap_can_be_driven(tmp_path: Path) -> None:
+    found = experiment(tmp_path, "plus-minus")
+    assert panels([found], "plus") == (BUMPS, LAPS, DISTANCE)
+    assert panels([found], "minus") == (BUMPS, COVERAGE, DISTANCE)
+
+
+def test_much_circling_is_told_aloud(tmp_path: Path) -> None:
+    folder = experiment(tmp_path, "policy-roulette").runs[0].folder
+    for circling, warned in (("0.02", False), ("0.9", True)):
+        rows = [dict(row) for row in read_run(folder).evaluations.rows]
+        for row in rows:
+            row["circling"] = circling
+        write_csv(folder / "evaluations.csv", EVALUATION_COLUMNS, rows)
+        (found,) = load([folder])
+        assert ("Mind the circling" in sentences(report.section_of(found))) == warned
 
 
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from experiments.statistics import (
     band_of_blocks,
     block_means,
     bootstrap_difference,
+    from_the_start,
     with_gaps,
 )
 
@@ -65,6 +66,13 @@ def test_long_stretches_without_values_become_gaps() -> None:
     band = with_gaps(Band(x, x, x, x, 1), 3.0)
     np.testing.assert_array_equal(band.x, [1, 2, 5.5, 9, 10])
     np.testing.assert_array_equal(band.median, [1, 2, math.nan, 9, 10])
+
+
+def test_a_band_can_be_counted_from_its_start() -> None:
+    x = np.array([1510.0, 1520.0])
+    band = from_the_start(Band(x, x, x, x, 1), 1501.0)
+    np.testing.assert_array_equal(band.x, [10, 20])
+    np.testing.assert_array_equal(band.median, x)
 
 
 @given(
