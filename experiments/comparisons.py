@@ -8,16 +8,26 @@ from functools import partial
 from experiments import findings
 from experiments.document import Block, Findings, Missing, Picture, Section, Table
 from experiments.figures import evaluation, probes, progress
-from experiments.measures import Kept, compare, kept, max_mean_fitness, number, of_seeds, spread
+from experiments.measures import (
+    MISSING,
+    Kept,
+    compare,
+    kept,
+    max_mean_fitness,
+    number,
+    of_seeds,
+    spread,
+)
 from experiments.runs import Experiment
 
 POLICY = "policy-"
 """Experiments whose name begins so are rows of the table of policies (Fig 4.2)."""
 PROBES_SHOWN = 6
-EXPECTED_BEST_FIRST = {
-    name: rank
-    for rank, name in enumerate(("plus-rmm", "plus-rmm-nopretrain", "plus-normm-fit", "plus-normm"))
-}
+EXPECTED_BEST_FIRST = (
+    "plus-rmm", "plus-rmm-nopretrain", "plus-normm-fit", "plus-normm-fit-alone", "plus-normm",
+)  # fmt: skip
+RETURNING = ("plus-minus", "plus-minus-normm")
+"""Go on from Plus to another corridor, and come back."""
 Named = dict[str, Experiment]
 
 
@@ -32,8 +42,8 @@ def compare_all(experiments: Sequence[Experiment]) -> list[Section]:
                 *_continued(named),
                 *_fitted(named),
                 *_frozen(named),
-                *_predictions(named, "plus-rmm", "best", "plus-normm", "best", "4.10"),
-                *_predictions(named, "plus-minus", "end", "plus-rmm", "best", "4.16"),
+                *_predictions(named, "plus-rmm", "plus-normm", "4.10", of_best=True),
+                *_predictions(named, "plus-minus", "plus-rmm", "4.16", of_best=False),
                 *_kept(named),
             )
             sections.append(Section(f"comparisons-{scale}", f"Comparisons, {scale} scale", blocks))
@@ -52,8 +62,8 @@ def _policies(named: Named) -> list[Block]:
     rows = tuple(
         (
             e.first.title,
-            str(e.first.episodes),
-            str(e.first.thesis.get("max_mean_fitness", "-")),
+            number(len(e.runs[0].episodes)),
+            number(float(e.first.thesis.get("fitness", MISSING))),
             spread(of_seeds(e, max_mean_fitness)),
             str(len(e.runs)),
         )
@@ -62,7 +72,8 @@ def _policies(named: Named) -> list[Block]:
     window = shown[0].runs[0].window
     title = f"Action policies (Fig 4.2): highest mean fitness of {window} episodes"
     header = ("policy", "episodes", "thesis (100 episodes)", "ours, median and span", "seeds")
-    return [Table(title, header, rows), *_sentences(findings.policies(shown))]
+    told = [*findings.policies(shown), *findings.same_start(shown)]
+    return [Table(title, header, rows), Findings(tuple(told))]
 
 
 def _sentences(sentences: Sequence[str]) -> list[Block]:
@@ -126,7 +137,8 @@ def _comparable(named: Named) -> dict[str, list[Experiment]]:
 
 def _rank(item: tuple[str, Experiment]) -> tuple[int, str]:
     """RMM before NoRMM, so that a negative difference means that RMM bumped less."""
-    return (EXPECTED_BEST_FIRST.get(item[0], len(EXPECTED_BEST_FIRST)), item[0])
+    name, known = item[0], EXPECTED_BEST_FIRST
+    return (known.index(name) if name in known else len(known), name)
 
 
 def _together(group: str, shown: Sequence[Experiment]) -> list[Block]:
@@ -147,22 +159,29 @@ def _together(group: str, shown: Sequence[Experiment]) -> list[Block]:
         drawn = partial(evaluation.differences, pairs)
         name = f"{scale}-differences-{group}"
         blocks.append(Picture(name, "Differences between experiments", caption, drawn))
-        blocks.append(Findings(tuple(findings.difference(pair) for pair in pairs)))
+        told = [*(findings.difference(pair) for pair in pairs), *findings.same_start(shown)]
+        blocks.append(Findings(tuple(told)))
     return [*blocks, *(Missing("difference of bumps", line) for line in refused)]
 
 
 def _predictions(
-    named: Named, ours: str, our_weights: str, theirs: str, their_weights: str, figure: str
+    named: Named, ours: str, theirs: str, figure: str, *, of_best: bool
 ) -> list[Block]:
-    """Two networks on the same images of Plus, the lowest seeds (Fig 4.10, 4.16)."""
+    """Two networks on the same images of Plus, the lowest seeds (Fig 4.10, 4.16).
+
+    Args:
+        named: All experiments of a scale.
+        ours: The one above.
+        theirs: The one below, always with its best weights if their predictions are there.
+        figure: Of the thesis.
+        of_best: Whether the best or the last weights of `ours` are asked for.
+    """
     what = f"Predicted rewards in plus, {ours} and {theirs} (Fig {figure})"
     if not (ours in named and theirs in named):
         return _missing(what, named, (ours, theirs))
-    first = probes.choose(named[ours], "plus", our_weights)
-    second = probes.choose(named[theirs], "plus", their_weights)
+    first, second = _weights(named[ours], of_best), _weights(named[theirs], True)
     if first is None or second is None:
-        absent = ours if first is None else theirs
-        return [Missing(what, f"{absent} has no probes of Plus with these weights")]
+        return [Missing(what, f"{ours if first is None else theirs} has no probes of Plus")]
     if not probes.same_images(first.probes, second.probes):
         return [Missing(what, "the two were asked about different images")]
     networks = [
@@ -170,24 +189,38 @@ def _predictions(
         probes.Predictions(theirs, second.probes.values),
     ]
     caption = (
-        f"Upper bars: {our_weights} weights of {ours}, seed {first.seed}; lower bars: "
-        f"{their_weights} weights of {theirs}, seed {second.seed}. From −1 to 1."
+        f"Upper bars: {ours}, seed {first.seed}, {first.weights}; lower bars: {theirs}, seed "
+        f"{second.seed}, {second.weights}. From −1 to 1. The thesis shows "
+        f"{'the best' if of_best else 'the last'} weights above and the best below."
     )
     drawn = partial(probes.predictions, first.probes, networks, PROBES_SHOWN)
     return [Picture(f"{named[ours].scale}-probes-{ours}-{theirs}", what, caption, drawn)]
 
 
+def _weights(experiment: Experiment, of_best: bool) -> probes.Choice | None:
+    """Best weights if asked for and looked at, else the last; the caption says which."""
+    found = probes.best(experiment, "plus") if of_best else None
+    return found or probes.last(experiment, "plus")
+
+
 def _kept(named: Named) -> list[Block]:
-    """What Plus-Minus kept of Plus."""
-    if "plus-minus" not in named:
-        return []
-    starts = {run.info.seed: run for run in named["plus-rmm"].runs} if "plus-rmm" in named else {}
+    """What is left of Plus after learning Minus, with RMM and without."""
+    what = "Kept of Plus: actions between bumps in frozen drives before and after Minus"
+    blocks: list[Block] = []
+    for name in RETURNING:
+        if name in named:
+            blocks += _kept_by(named, named[name], f"{what}, {name}")
+    return blocks
+
+
+def _kept_by(named: Named, experiment: Experiment, title: str) -> list[Block]:
+    before = named.get(experiment.first.after)
+    starts = {run.info.seed: run for run in before.runs} if before is not None else {}
     found: list[Kept] = []
-    for run in named["plus-minus"].runs:
+    for run in experiment.runs:
         entry = kept(run, "plus", starts.get(run.info.seed))
         if entry is not None:
             found.append(entry)
-    title = "Kept of Plus: actions between bumps in frozen drives before and after Minus"
     if not found:
         return [Missing(title, "no seed drove frozen in Plus before and after the Minus stage")]
     rows = tuple(

@@ -14,9 +14,9 @@ from experiments.figures.evaluation import Compared
 from experiments.figures.progress import curve_of
 from experiments.figures.style import ACTIONS
 from experiments.measures import (
-    MEASURED,
     Kept,
     evaluated,
+    longest_run,
     max_mean_fitness,
     number,
     of_seeds,
@@ -35,6 +35,8 @@ EXPECTED_FEWER_BUMPS = {
     ("plus-rmm", "plus-normm"),
     ("plus-rmm", "plus-normm-fit"),
     ("plus-rmm-nopretrain", "plus-normm-fit"),
+    ("plus-rmm-nopretrain", "plus-normm-fit-alone"),
+    ("plus-minus", "plus-minus-normm"),
 }
 """Which of two the thesis holds for the better one (4.3.2)."""
 
@@ -48,7 +50,7 @@ def completeness(experiment: Experiment) -> list[str]:
     seeds = ", ".join(str(run.info.seed) for run in experiment.runs)
     told = [f"Seeds: {seeds}."]
     told += [
-        f"Seed {run.info.seed} is not complete: {number(run.info.episodes)} episodes so far."
+        f"Seed {run.info.seed} is not complete: {number(len(run.episodes))} episodes so far."
         for run in experiment.runs
         if not run.info.complete
     ]
@@ -62,12 +64,37 @@ def fitness(experiment: Experiment) -> list[str]:
         return ["Too few episodes for a point of the fitness curve."]
     window = experiment.runs[0].window
     told = f"The highest mean fitness over {window} episodes was {spread(values)}"
-    theirs = experiment.first.thesis.get("max_mean_fitness")
-    longest = spread(of_seeds(experiment, MEASURED["longest_run"].of))
+    theirs = experiment.first.thesis.get("fitness")
+    longest = spread(of_seeds(experiment, longest_run))
     return [
         f"{told}; thesis: {theirs}." if theirs is not None else f"{told}.",
         f"The longest way without a bump had {longest} actions.",
     ]
+
+
+def first_lap(experiment: Experiment) -> list[str]:
+    """When frozen networks first drove a whole lap, where that was looked at."""
+    laps = [run.info.first_lap for run in experiment.runs]
+    driven = [lap for lap in laps if lap]
+    if not driven:
+        return []
+    actions, seconds = (np.array([lap[name] for lap in driven]) for name in ("actions", "seconds"))
+    told = f"{len(driven)} of {len(laps)} seeds drove a first lap frozen, after {spread(actions)} "
+    return [f"{told} actions, {spread(seconds)} s of learning."]
+
+
+def same_start(experiments: Sequence[Experiment]) -> list[str]:
+    """Whether seeds that several experiments share began with equal memories (A38, A46)."""
+    if len(experiments) < 2:
+        return []
+    fills: dict[int, set[str]] = {}
+    for experiment in experiments:
+        for run in experiment.runs:
+            fills.setdefault(run.info.seed, set()).add(run.info.prefill)
+    differ = [str(seed) for seed, prefills in sorted(fills.items()) if len(prefills) > 1]
+    if differ:
+        return [f"The memories did not begin equal in seed {', '.join(differ)}."]
+    return ["Of every seed, the memory began equal in all of them."]
 
 
 def loss(experiment: Experiment) -> list[str]:
@@ -98,19 +125,21 @@ def _loss_sides(run: Run) -> tuple[float, float] | None:
 
 
 def memory(experiment: Experiment) -> list[str]:
-    """Shares of the actions at the end, and whether they are balanced."""
+    """Shares of the actions at the end, and whether they are balanced in most seeds."""
     shares = {name: of_seeds(experiment, partial(_share, name)) for name in ACTIONS}
     if not len(shares["forward"]):
         return []
     middles = [float(np.median(values)) for values in shares.values()]
-    balanced = max(middles) - min(middles) <= BALANCED
+    together = np.stack(list(shares.values()))
+    balanced = float(np.median(np.ptp(together, axis=0))) <= BALANCED
     told = ", ".join(
         f"{name} {100 * middle:.1f} %" for name, middle in zip(ACTIONS, middles, strict=True)
     )
     word = "balanced" if balanced else "not balanced"
     expected = EXPECTED_BALANCED.get(experiment.name)
     end = "" if expected is None else f", {_verdict(expected == balanced)}"
-    return [f"At the end the memory held {told} (medians of the seeds): {word}{end}."]
+    when = "At the end" if all(run.info.complete for run in experiment.runs) else "So far"
+    return [f"{when} the memory held {told} (medians of the seeds): {word}{end}."]
 
 
 def _share(action: str, run: Run) -> float:
@@ -153,10 +182,12 @@ def evaluation(experiment: Experiment, world: str) -> list[str]:
         if len(other):
             told += f"; {driver}: {number(float(np.median(other)))} bumps"
     sentences = [told + "."]
-    if len(circling) and float(np.median(circling)) > MUCH_CIRCLING:
+    much = int(np.sum(circling > MUCH_CIRCLING))
+    if much:
         sentences.append(
-            f"Mind the circling in {world}: {100 * float(np.median(circling)):.0f} % of the time, "
-            "so few bumps alone do not mean that it gets anywhere."
+            f"Mind the circling in {world}, {spread(100 * circling)} % of the time: {much} of "
+            f"{len(circling)} seeds circle more than {100 * MUCH_CIRCLING:.0f} % of it, so few "
+            "bumps or a high fitness do not mean that they get anywhere."
         )
     return sentences
 

@@ -40,31 +40,32 @@ def max_mean_fitness(run: Run) -> float:
 
 def longest_run_episode(run: Run) -> float:
     """Episode in which the longest way without a bump got its full length."""
-    lengths = run.episodes.numbers("longest_run_actions")
-    if not np.any(~np.isnan(lengths)):
-        return MISSING
-    return float(run.episodes.numbers("episode")[np.nanargmax(lengths)])
+    lengths = run.runs_without_bump
+    return float(run.episodes.numbers("episode")[np.argmax(lengths)]) if len(lengths) else MISSING
+
+
+def longest_run(run: Run) -> float:
+    """Most actions without a bump in the run's own episodes."""
+    return float(np.max(run.runs_without_bump)) if len(run.episodes) else MISSING
 
 
 def actions_per_episode(run: Run) -> float:
     """Mean of all episodes."""
-    return run.info.actions / run.info.episodes if run.info.episodes else MISSING
+    return run.actions / len(run.episodes) if len(run.episodes) else MISSING
 
 
 MEASURED = {
-    "episodes": Measure("episodes", lambda run: float(run.info.episodes), scales=True),
-    "actions": Measure("actions", lambda run: float(run.info.actions), scales=True),
+    "episodes": Measure("episodes", lambda run: float(len(run.episodes)), scales=True),
+    "actions": Measure("actions", lambda run: float(run.actions), scales=True),
     "actions_per_episode": Measure("actions per episode", actions_per_episode, scales=False),
     "capacity": Measure(
         "largest capacity of the memory", lambda run: _highest(run, "capacity"), scales=True
     ),
-    "longest_run": Measure(
-        "most actions without a bump", lambda run: _highest(run, "longest_run_actions"), scales=True
-    ),
+    "longest_run": Measure("most actions without a bump", longest_run, scales=True),
     "longest_run_episode": Measure(
         "episode of the longest way without a bump", longest_run_episode, scales=True
     ),
-    "max_mean_fitness": Measure("highest mean fitness", max_mean_fitness, scales=False),
+    "fitness": Measure("highest mean fitness", max_mean_fitness, scales=False),
     "max_threshold_percent": Measure(
         "highest threshold (%)", lambda run: _highest(run, "threshold_percent"), scales=False
     ),
@@ -143,7 +144,7 @@ def kept(run: Run, world: str, start: Run | None) -> Kept | None:
     """
     stages = run.info.stages
     away = [stage for stage in stages if stage.world != world]
-    if not away or stages[0].world == world:
+    if not away or away[-1].last_episode is None or stages[0].world == world:
         return None
     first, last = stages[0].first_episode, away[-1].last_episode
     rows = run.evaluated(world)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from experiments import findings, runs
+from experiments import findings, routes, runs
 from experiments.comparisons import compare_all
 from experiments.document import (
     Block,
@@ -25,7 +25,7 @@ from experiments.document import (
     markdown,
     write_pictures,
 )
-from experiments.figures import evaluation, memory, probes, progress, route
+from experiments.figures import evaluation, memory, probes, progress
 from experiments.figures.style import stages_text
 from experiments.measures import MEASURED, evaluated, number, of_seeds, spread
 from experiments.runs import Experiment, Run
@@ -47,8 +47,8 @@ THESIS_FIGURES = {
     ("plus-rmm", "memory"): "Fig 4.11",
     ("plus-minus", "fitness"): "Fig 4.14",
     ("plus-minus", "worlds"): "Fig 4.15",
-    ("plus-minus", "probes-end-minus"): "Fig 4.17",
-    ("i16c", "probes-end-i16c"): "Fig 4.19",
+    ("plus-minus", "probes-last-minus"): "Fig 4.17",
+    ("i16c", "probes-last-i16c"): "Fig 4.19",
     ("i16c-test", "route"): "Fig 4.20",
 }
 """Which of our figures stands for which of the thesis."""
@@ -108,8 +108,8 @@ def overview_blocks(
 def _number_rows(run: Run) -> list[tuple[str, ...]]:
     """One row per corridor driven in frozen, the run's own numbers in the first only."""
     info = run.info
-    own = (f"{info.seconds:,.0f}", f"{info.actions:,}", f"{info.episodes:,}",
-           f"{info.train_steps:,}")  # fmt: skip
+    own = (f"{info.seconds:,.0f}", f"{run.actions:,}", f"{len(run.episodes):,}",
+           f"{run.train_steps:,}")  # fmt: skip
     worlds = dict.fromkeys(run.evaluations.where(driver="network").words("world")) or ["-"]
     rows = []
     for world in worlds:
@@ -131,14 +131,13 @@ def _costs(experiments: Sequence[Experiment], gpu_step_ms: float | None) -> Tabl
         header.append(f"projected hours of gradient steps on a GPU, {gpu_step_ms:g} ms each")
     rows = []
     for experiment in experiments:
-        infos = [run.info for run in experiment.runs]
-        steps = sum(info.train_steps for info in infos)
+        steps = sum(run.train_steps for run in experiment.runs)
         row = [
             experiment.full_name,
-            str(len(infos)),
-            f"{sum(info.actions for info in infos):,}",
+            str(len(experiment.runs)),
+            f"{sum(run.actions for run in experiment.runs):,}",
             f"{steps:,}",
-            f"{sum(info.seconds for info in infos) / 3600:.2f}",
+            f"{sum(run.info.seconds for run in experiment.runs) / 3600:.2f}",
         ]
         if gpu_step_ms is not None:
             row.append(f"{steps * gpu_step_ms / MS_PER_H:.2f}")
@@ -195,14 +194,15 @@ def _progress(experiment: Experiment) -> list[Block]:
     if len(short) == len(experiment.runs):
         why = f"fewer than {window} episodes in every seed"
         return [Missing("fitness and loss over episodes", why)]
-    stages = stages_text(experiment.first.stages)
+    stages = stages_text(experiment.runs[0].stages)
     about = f"Fitness, averaged over {window} episodes; green: episodes that reached 500."
     if window != runs.WINDOW:
         about += f" The thesis averages {runs.WINDOW}; this run is 1/{experiment.first.factor:g}."
     caption = f"{about} {_seeds_text(experiment)} {stages}"
     drawn = partial(progress.fitness, experiment)
     blocks: list[Block] = [_picture(experiment, "fitness", "Fitness", caption, drawn)]
-    blocks.append(Findings(tuple(findings.fitness(experiment))))
+    told = [*findings.fitness(experiment), *findings.first_lap(experiment)]
+    blocks.append(Findings(tuple(told)))
     if not any(len(progress.curve_of(run, "loss")[0]) for run in experiment.runs):
         return [*blocks, Missing("loss over episodes", "nothing was trained")]
     caption = f"Loss, averaged over {window} episodes. {_seeds_text(experiment)} {stages}"
@@ -250,49 +250,50 @@ def _evaluations(experiment: Experiment) -> list[Block]:
 
 
 def _probes(experiment: Experiment) -> list[Block]:
-    """What the best and the last weights of the lowest seed predict, one figure per corridor."""
-    found = {
-        (prefix, probe.world): probes.choose(experiment, probe.world, prefix)
-        for run in experiment.runs
-        for probe in run.probes
-        for prefix in ("best", "end")
-    }
+    """What the best and the last weights predict, one figure per corridor."""
+    worlds = sorted({entry.world for run in experiment.runs for entry in run.probes})
     blocks: list[Block] = []
-    for (prefix, world), choice in sorted(found.items()):
-        if choice is None:
-            continue
-        weights = "best" if prefix == "best" else "last"
-        drawn = partial(
-            probes.predictions,
-            choice.probes,
-            [probes.Predictions("reward", choice.probes.values)],
-            PROBES_SHOWN,
-        )
-        caption = (
-            f"Images of the set {choice.probes.set_name}, and the rewards that the {weights} "
-            f"weights of seed {choice.seed} predict for left, forward and right, from −1 to 1."
-        )
-        title = f"Predicted rewards in {world}, {weights} weights"
-        kind = f"probes-{prefix}-{world}"
-        blocks.append(_picture(experiment, kind, title, caption, drawn))
-    return blocks or [Missing("predicted rewards", "there is no probes-best or probes-end file")]
+    for world in worlds:
+        for kind, choice in (
+            (f"probes-best-{world}", probes.best(experiment, world)),
+            (f"probes-last-{world}", probes.last(experiment, world)),
+        ):
+            if choice is not None:
+                blocks.append(_predictions(experiment, kind, choice))
+            elif (experiment.name, kind) in THESIS_FIGURES:
+                theirs = THESIS_FIGURES[experiment.name, kind]
+                blocks.append(Missing(f"predicted rewards ({theirs})", f"there is no {kind} file"))
+    return blocks or [Missing("predicted rewards", "there are no files of probes")]
+
+
+def _predictions(experiment: Experiment, kind: str, choice: probes.Choice) -> Picture:
+    entry = choice.probes
+    networks = [probes.Predictions("reward", entry.values)]
+    drawn = partial(probes.predictions, entry, networks, PROBES_SHOWN)
+    caption = (
+        f"A fixed set of images of {entry.world}, and the rewards predicted for left, forward and "
+        f"right, from −1 to 1, by seed {choice.seed}: {choice.weights}."
+    )
+    title = f"Predicted rewards in {entry.world}, {kind.split('-')[1]} weights"
+    return _picture(experiment, kind, title, caption, drawn)
 
 
 def _routes(experiment: Experiment) -> list[Block]:
+    theirs = THESIS_FIGURES.get((experiment.name, "route"))
     blocks: list[Block] = []
     for run in experiment.runs:
-        for drive in run.routes:
+        for label, drive in run.routes.items():
+            name = drive.trace.world
             events = "; ".join(f"{e.number} (action {e.action}) {e.text}" for e in drive.events)
-            seed = f"Drive {drive.label} of seed {run.info.seed} in {drive.world}."
-            caption = f"{seed} Numbers: {events}." if events else seed
-            title = f"Route in {drive.world}"
-            if theirs := THESIS_FIGURES.get((experiment.name, "route")):
-                title += f" ({theirs})"
-            drawn = partial(route.route, drive, _world(drive.world, run.folder))
-            kind = f"route-{drive.label}-{run.info.seed}"
+            caption = f"Drive {label} of seed {run.info.seed} in {name}."
+            caption += f" Numbers: {events}." if events else ""
+            title = f"Route in {name} ({theirs})" if theirs else f"Route in {name}"
+            world = _world(name, run.folder)
+            drawn = partial(routes.figure, world, [drive.trace], title, drive.events)
+            kind = f"route-{label}-{run.info.seed}"
             blocks.append(_picture(experiment, kind, title, caption, drawn))
-    if not blocks and (experiment.name, "route") in THESIS_FIGURES:
-        return [Missing("route (Fig 4.20)", "there is no route file")]
+    if not blocks and theirs:
+        return [Missing(f"route ({theirs})", "there is no route file")]
     return blocks
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -23,6 +24,8 @@ WIDTH_IN = 7.5
 LEGEND_IN = 1.1
 DPI = 150
 SCALE_M = 2
+EVENT_GAP_PT = 13
+"""Distance of an event's number from its place, so that the way stays visible."""
 _FREE, _SOLID, _INK, _BOX = "#f7f6f2", "#cececa", "#282c34", "#a9825a"
 _BUMP, _START, _END = "#d55e00", "#009e73", "#282c34"
 _WAY = "#0072b2"
@@ -86,17 +89,24 @@ def read(path: Path) -> Route:
 
 
 def draw(path: Path, world: World, traces: Sequence[Trace], title: str) -> None:
-    """Draw drives on the top view of their world as a PNG: ways, starts, ends and bumps.
+    """The same as `figure`, written to a PNG file."""
+    figure(world, traces, title).savefig(path, format="png")
+
+
+def figure(
+    world: World, traces: Sequence[Trace], title: str, events: Sequence[Event] = ()
+) -> Figure:
+    """Drives on the top view of their world: ways, starts, ends and bumps (Fig 4.20).
 
     Args:
-        path: Of the PNG.
         world: Where they drove.
         traces: At least one.
         title: What stands above.
+        events: Of the first drive; their numbers stand beside the way.
     """
-    figure, (x0, y0, x1, y1) = Figure(dpi=DPI, layout="constrained"), world.bounds
-    figure.set_size_inches(WIDTH_IN, WIDTH_IN * (y1 - y0) / (x1 - x0) + LEGEND_IN)
-    axes = figure.subplots()
+    sheet, (x0, y0, x1, y1) = Figure(dpi=DPI, layout="constrained"), world.bounds
+    sheet.set_size_inches(WIDTH_IN, WIDTH_IN * (y1 - y0) / (x1 - x0) + LEGEND_IN)
+    axes = sheet.subplots()
     axes.set_facecolor(_SOLID)
     for wall in world.walls:
         face = _FREE if wall.area_m2 > 0.0 else _SOLID
@@ -115,14 +125,26 @@ def draw(path: Path, world: World, traces: Sequence[Trace], title: str) -> None:
     ]
     for places, marker, colour, _ in marks:
         axes.plot(*places.T, marker, color=colour, markersize=6, markeredgewidth=1.6, zorder=4)
-    _scale_bar(figure, world)
+    _scale_bar(sheet, world)
     margin = 0.15
     axes.set(xlim=(x0 - margin, x1 + margin), ylim=(y0 - 0.75, y1 + margin), aspect="equal")
     axes.set_axis_off()
     axes.add_patch(Rectangle((0, 0), 1, 1, transform=axes.transAxes, facecolor=_SOLID, zorder=-1))
     axes.set_title(title, fontsize=10, color=_INK)
-    figure.legend(handles=_legend(traces, marks), loc="outside lower center", ncols=4, fontsize=9)
-    figure.savefig(path, format="png")
+    sheet.legend(handles=_legend(traces, marks), loc="outside lower center", ncols=4, fontsize=9)
+    _mark(axes, traces[0], events)
+    return sheet
+
+
+def _mark(axes: Axes, trace: Trace, events: Sequence[Event]) -> None:
+    for event in events:
+        x, y = trace.places_m[min(event.action, len(trace.bumps))]
+        axes.annotate(
+            str(event.number), (float(x), float(y)), textcoords="offset points",
+            xytext=(EVENT_GAP_PT, EVENT_GAP_PT), ha="center", va="center", fontsize=9, zorder=5,
+            arrowprops={"arrowstyle": "-", "color": _INK, "shrinkB": 0},
+            bbox={"boxstyle": "circle,pad=0.25", "facecolor": "white", "edgecolor": _INK},
+        )  # fmt: skip
 
 
 def bump_places(trace: Trace) -> npt.NDArray[np.float64]:

@@ -6,7 +6,6 @@ One folder per seed; seeds of one experiment at one scale belong together. Kept 
 
 from __future__ import annotations
 
-import json
 import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -18,7 +17,9 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from experiments import routes
 from experiments.records import EPISODE_COLUMNS, EVALUATION_COLUMNS, by_world, read_csv
+from experiments.routes import Route
 from shared.errors import ConfigError, StateError
 
 Floats = npt.NDArray[np.float64]
@@ -34,16 +35,24 @@ class _Record(BaseModel):
     model_config = ConfigDict(frozen=True)
 
 
-class Stage(_Record):
+class StageInfo(_Record):
     """A part of a run with settings of its own; episodes are counted globally."""
 
     name: str
     world: str
     first_episode: int
+    last_episode: int | None = None
+    """None while the stage goes on."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """The same with an end, for figures: the newest episode while it goes on."""
+
+    name: str
+    world: str
+    first_episode: int
     last_episode: int
-    actions: int
-    train_steps: int
-    seconds: float
 
 
 class RunInfo(_Record):
@@ -55,21 +64,25 @@ class RunInfo(_Record):
     factor: float = Field(gt=0.0)
     """How many times fewer episodes and samples than in the thesis; 1 at full scale."""
     seed: int
+    after: str
+    """The experiment whose end this one began with; empty for none."""
     command: str
     commit: str
     machine: str
     python: str
     torch: str
     started: str
-    finished: str | None
+    finished: str
+    """Empty while the run goes on."""
     seconds: float
-    actions: int
-    episodes: int
-    train_steps: int
     complete: bool
-    stages: tuple[Stage, ...]
+    prefill: str
+    """Hash of the memory as the first episode began."""
+    first_lap: dict[str, float]
+    """When the frozen network first drove a lap; empty if it has not, or nobody looked."""
+    stages: tuple[StageInfo, ...]
     thesis: dict[str, Any]
-    """The thesis's numbers for this experiment, by the names of `report.MEASURED`, or as text."""
+    """The thesis's numbers for this experiment, by the names of `measures.MEASURED`, or as text."""
 
 
 @dataclass(frozen=True)
@@ -100,34 +113,12 @@ class Probes:
     """Images of a fixed set, and what one network predicts for them."""
 
     label: str
+    """Stage and world, or `best` and world."""
     world: str
-    set_name: str
     images: npt.NDArray[np.uint8]
     """uint8 [n, 50, 75]."""
     values: Floats
     """float64 [n, 3]: clipped rewards of forward, forward/left, forward/right."""
-
-
-@dataclass(frozen=True)
-class Event:
-    """Something on a drive that is worth a number on the map."""
-
-    number: int
-    action: int
-    text: str
-
-
-@dataclass(frozen=True)
-class Route:
-    """The way of one drive of n actions."""
-
-    label: str
-    world: str
-    places_m: Floats
-    """float64 [n + 1, 2]."""
-    bumps: npt.NDArray[np.bool_]
-    """bool [n]."""
-    events: tuple[Event, ...]
 
 
 @dataclass(frozen=True)
@@ -139,12 +130,47 @@ class Run:
     episodes: Rows
     evaluations: Rows
     probes: tuple[Probes, ...]
-    routes: tuple[Route, ...]
+    routes: dict[str, Route]
+    """By label."""
 
     @property
     def window(self) -> int:
         """Episodes averaged into one point: 100 (A37), fewer at a smaller scale, at least 10."""
         return max(LEAST_WINDOW, round(WINDOW / self.info.factor))
+
+    @property
+    def actions(self) -> int:
+        """Actions of this run's own episodes; columns and evaluations count predecessors too."""
+        return int(np.nansum(self.episodes.numbers("actions")))
+
+    @property
+    def train_steps(self) -> int:
+        """Gradient steps from the run's second episode on, and the mini-batches of its first."""
+        steps = self.episodes.numbers("train_steps")
+        if not len(steps):
+            return 0
+        return int(steps[-1] - steps[0] + self.episodes.numbers("mini_batches")[0])
+
+    @cached_property
+    def runs_without_bump(self) -> Floats:
+        """Actions without a bump at the end of every episode, over episodes of this run (E10)."""
+        lengths, length = [], 0.0
+        actions, bumps = self.episodes.numbers("actions"), self.episodes.numbers("bump")
+        for driven, bump in zip(actions, bumps, strict=True):
+            length += driven
+            lengths.append(length - bump)
+            length *= 1 - bump
+        return np.array(lengths, np.float64)
+
+    @property
+    def stages(self) -> tuple[Stage, ...]:
+        """The stages so far."""
+        numbers = self.episodes.numbers("episode")
+        newest = int(numbers[-1]) if len(numbers) else 0
+        return tuple(
+            Stage(s.name, s.world, s.first_episode, s.last_episode or max(newest, s.first_episode))
+            for s in self.info.stages
+        )
 
     @cached_property
     def samples_by_world(self) -> dict[str, Floats]:
@@ -237,7 +263,10 @@ def read_run(folder: Path) -> Run:
         _table(episodes, EPISODE_COLUMNS),
         _table(folder / "evaluations.csv", EVALUATION_COLUMNS),
         tuple(_probes(path) for path in sorted(folder.glob("probes-*.npz"))),
-        tuple(_route(path) for path in sorted(folder.glob("route-*.npz"))),
+        {
+            path.stem.removeprefix("route-"): routes.read(path)
+            for path in sorted(folder.glob("route-*.npz"))
+        },
     )
 
 
@@ -275,7 +304,7 @@ def _probes(path: Path) -> Probes:
     arrays = _arrays(path)
     try:
         images, values = arrays["images"], arrays["values"]
-        world, set_name = str(arrays["world"]), str(arrays["set"])
+        world = str(arrays["world"])
     except KeyError as error:
         raise StateError(f"{path}: expected an array {error}, found none") from error
     if images.shape[1:] != IMAGE or images.dtype != np.uint8:
@@ -283,17 +312,4 @@ def _probes(path: Path) -> Probes:
     if values.shape != (len(images), 3):
         raise StateError(f"{path}: expected values [{len(images)}, 3], got {values.shape}")
     label = path.stem.removeprefix("probes-")
-    return Probes(label, world, set_name, images, values.astype(np.float64))
-
-
-def _route(path: Path) -> Route:
-    arrays = _arrays(path)
-    try:
-        places, bumps = arrays["places_m"].astype(np.float64), arrays["bumps"].astype(np.bool_)
-        world, events = str(arrays["world"]), json.loads(str(arrays["events"]))
-        told = tuple(Event(int(e["number"]), int(e["action"]), str(e["text"])) for e in events)
-    except (KeyError, TypeError, ValueError) as error:
-        raise StateError(f"{path}: expected places, bumps, world and events: {error}") from error
-    if places.shape != (len(bumps) + 1, 2):
-        raise StateError(f"{path}: expected places [{len(bumps) + 1}, 2], got {places.shape}")
-    return Route(path.stem.removeprefix("route-"), world, places, bumps, told)
+    return Probes(label, world, images, values.astype(np.float64))

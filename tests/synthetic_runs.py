@@ -10,9 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from experiments import routes
 from experiments.records import EPISODE_COLUMNS, EVALUATION_COLUMNS, Row, write_csv
+from experiments.routes import Event
+from experiments.traces import Trace
 
 FACTOR = 10.0
+AFTER = {"plus-normm-fit": "plus-normm", "plus-minus": "plus-rmm", "i16c": "plus-minus"}
 
 
 @dataclass(frozen=True)
@@ -44,11 +48,11 @@ SHAPES = {
     "plus-minus": Shape((("Minus", "minus", 150), ("Plus", "plus", 150)), 701, best=280, bumps=5),
     "i16c": Shape((("I16c", "i16c", 300),), 1001, best=100, bumps=12),
     "policy-eps-greedy": Shape((("learn", "plus", 100),), best=40,
-                               thesis=(("max_mean_fitness", 38),)),
+                               thesis=(("fitness", 38),)),
     "policy-roulette": Shape((("learn", "plus", 100),), best=15,
-                             thesis=(("max_mean_fitness", 16),)),
+                             thesis=(("fitness", 16),)),
     "policy-eps-greedy-roulette": Shape((("learn", "plus", 100),), best=35,
-                                        thesis=(("max_mean_fitness", 36),)),
+                                        thesis=(("fitness", 36),)),
 }  # fmt: skip
 
 
@@ -69,7 +73,7 @@ def write_run(out: Path, experiment: str, seed: int, **changes: Any) -> Path:
     write_csv(folder / "episodes.csv", EPISODE_COLUMNS, episodes)
     write_csv(folder / "evaluations.csv", EVALUATION_COLUMNS, _evaluations(shape, episodes, draw))
     worlds = {world for _, world, _ in shape.stages} | ({"plus"} if "plus" in experiment else set())
-    for label in ("best", "end"):
+    for label in ("best", shape.stages[-1][0]):
         for world in sorted(worlds):
             write_probes(folder / f"probes-{label}-{world}.npz", world, draw)
     info = _info(experiment, shape, seed, episodes) | changes
@@ -169,23 +173,20 @@ def write_probes(path: Path, world: str, draw: np.random.Generator, count: int =
     ).astype(np.uint8)
     values = np.clip(draw.normal(0.3, 0.5, (count, 3)), -1, 1).astype(np.float32)
     np.savez_compressed(
-        path, images=images, values=values, world=np.array(world), set=np.array(f"{world} fixed"),
+        path, images=images, values=values, world=np.array(world),
         x_m=np.zeros(count), y_m=np.zeros(count), heading_rad=np.zeros(count),
     )  # fmt: skip
 
 
 def write_route(path: Path, world: str, places_m: list[tuple[float, float]]) -> None:
     """A way through places, with a bump at the second action and two events."""
-    bumps = np.zeros(len(places_m) - 1, np.bool_)
-    bumps[1] = True
-    events = [
-        {"number": 1, "action": 1, "text": "passes the window"},
-        {"number": 2, "action": len(bumps), "text": "turns"},
-    ]
-    np.savez_compressed(
-        path, places_m=np.array(places_m), bumps=bumps, world=np.array(world),
-        events=np.array(json.dumps(events)),
+    count = len(places_m) - 1
+    trace = Trace(
+        world, np.arange(count) == 1, np.array(places_m), np.zeros(count + 1), np.full(count, 0.1),
+        0, 0,
     )  # fmt: skip
+    events = (Event(1, 1, "passes the window"), Event(2, count, "turns"))
+    routes.write(path, routes.Route(trace, events))
 
 
 def _info(experiment: str, shape: Shape, seed: int, episodes: list[Row]) -> dict[str, Any]:
@@ -193,8 +194,7 @@ def _info(experiment: str, shape: Shape, seed: int, episodes: list[Row]) -> dict
     for name, world, count in shape.stages:
         stages.append({
             "name": name, "world": world, "first_episode": first,
-            "last_episode": first + count - 1, "actions": 100 * count,
-            "train_steps": count, "seconds": 1.0 * count,
+            "last_episode": first + count - 1,
         })  # fmt: skip
         first += count
     return {
@@ -202,7 +202,9 @@ def _info(experiment: str, shape: Shape, seed: int, episodes: list[Row]) -> dict
         "scale": "mini", "factor": FACTOR, "seed": seed,
         "command": f"experiment {experiment} --seed {seed}", "commit": "0123abc",
         "machine": "2 cores, AMD EPYC", "python": "3.11.9", "torch": "2.13.0",
-        "started": "2026-01-01T00:00:00", "finished": "2026-01-01T01:00:00",
+        "started": "2026-01-01T00:00:00Z", "finished": "2026-01-01T01:00:00Z",
+        "after": AFTER.get(experiment, ""), "prefill": f"fill-{seed}",
+        "first_lap": {"seconds": 60.0 * seed, "actions": 9000, "episode": 90},
         "seconds": 3600.0, "actions": episodes[-1]["total_actions"], "episodes": len(episodes),
         "train_steps": episodes[-1]["train_steps"], "complete": True, "stages": stages,
         "thesis": dict(shape.thesis),

@@ -75,7 +75,7 @@ def _drawn(
         limit = band_of_blocks(third)
         over.plot(limit.x, limit.median, ":", color=GREY, label="a third of the capacity")
         end.axhline(limit.median[-1], linestyle=":", color=GREY)
-    draw_stages(over, experiment.first.stages)
+    draw_stages(over, experiment.runs[0].stages)
     over.set_xlabel("episode")
     over.set_ylabel("samples in the memory")
     over.set_ylim(bottom=0)

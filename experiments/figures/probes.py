@@ -85,18 +85,30 @@ def _bars(axes: Axes, values: Floats, title: str | None) -> None:
 
 @dataclass(frozen=True)
 class Choice:
-    """Probes of one network, and whose they are."""
+    """Predictions of one network, and whose they are."""
 
     seed: int
+    weights: str
+    """Which weights of that seed, in words."""
     probes: Probes
 
 
-def choose(experiment: Experiment, world: str, prefix: str) -> Choice | None:
-    """The first probes of a world whose label begins so, of the lowest seed that has them."""
+def last(experiment: Experiment, world: str) -> Choice | None:
+    """Predictions at the end of the newest stage, of the lowest seed that has them."""
+    for run in experiment.runs:
+        labelled = {probes.label: probes for probes in run.probes}
+        for stage in reversed(run.info.stages):
+            if found := labelled.get(f"{stage.name}-{world}"):
+                return Choice(run.info.seed, f"weights at the end of stage {stage.name}", found)
+    return None
+
+
+def best(experiment: Experiment, world: str) -> Choice | None:
+    """Predictions by the weights of the longest way without a bump, of the lowest seed."""
     for run in experiment.runs:
         for probes in run.probes:
-            if probes.world == world and probes.label.startswith(prefix):
-                return Choice(run.info.seed, probes)
+            if probes.label == f"best-{world}":
+                return Choice(run.info.seed, "best weights", probes)
     return None
 
 

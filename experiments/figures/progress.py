@@ -56,7 +56,7 @@ def fitness(experiment: Experiment) -> Figure:
     draw_band(above, band_of(experiment, "fitness"), colour, f"mean of {window} episodes")
     for run in experiment.runs:
         _full_episodes(above, run)
-    draw_stages(above, experiment.first.stages)
+    draw_stages(above, experiment.runs[0].stages)
     _labels(above)
     _around_the_best(below, experiment, colour)
     figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=2)
@@ -101,7 +101,7 @@ def loss(experiment: Experiment) -> Figure:
     axes = figure.subplots()
     colour, window = colours([experiment.name])[experiment.name], experiment.runs[0].window
     draw_band(axes, band_of(experiment, "loss"), colour, f"mean of {window} episodes")
-    draw_stages(axes, experiment.first.stages)
+    draw_stages(axes, experiment.runs[0].stages)
     axes.set_yscale("log")
     axes.set_xlabel("episode")
     axes.set_ylabel("loss (squared error)")

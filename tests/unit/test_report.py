@@ -15,7 +15,7 @@ from experiments.document import Findings, Missing, Picture, Section, Table, htm
 from experiments.figures.evaluation import BUMPS, COVERAGE, DISTANCE, LAPS, Compared, panels
 from experiments.figures.probes import chosen
 from experiments.measures import kept, number, spread
-from experiments.records import EVALUATION_COLUMNS, write_csv
+from experiments.records import EPISODE_COLUMNS, EVALUATION_COLUMNS, write_csv
 from experiments.runs import Experiment, load, read_run
 from experiments.statistics import Difference
 from services.cli import main
@@ -87,6 +87,24 @@ def test_much_circling_is_told_aloud(tmp_path: Path) -> None:
         assert ("Mind the circling" in sentences(report.section_of(found))) == warned
 
 
+def test_seeds_that_favour_different_actions_are_not_balanced(tmp_path: Path) -> None:
+    found = experiment(tmp_path, "policy-roulette", (1, 2))
+    for run, favoured in zip(found.runs, ("left", "right"), strict=True):
+        rows = [dict(row) for row in run.episodes.rows]
+        rows[-1] |= {"left": "1000", "right": "1000", "forward": "1500", favoured: "2000"}
+        write_csv(run.folder / "episodes.csv", EPISODE_COLUMNS, rows)
+    (again,) = load([tmp_path])
+    assert "not balanced" in sentences(report.section_of(again))
+
+
+def test_memories_that_did_not_begin_equal_are_told(tmp_path: Path) -> None:
+    for name, fill in (("policy-roulette", "a"), ("policy-eps-greedy", "b")):
+        write_run(tmp_path, name, 1, prefill="same")
+        write_run(tmp_path, name, 2, prefill=fill)
+    (section,) = compare_all(load([tmp_path]))
+    assert "The memories did not begin equal in seed 2." in sentences(section)
+
+
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:
     found = experiment(tmp_path, "i16c")
     for path in found.runs[0].folder.iterdir():
@@ -105,7 +123,7 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
         "predicted rewards",
         "route (Fig 4.20)",
     ]
-    assert "Seed 1 is not complete: 300 episodes so far." in sentences(section)
+    assert "Seed 1 is not complete: 0 episodes so far." in sentences(section)
 
 
 def test_a_route_names_its_events(tmp_path: Path) -> None:

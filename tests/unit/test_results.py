@@ -49,7 +49,7 @@ def test_the_page_follows_from_what_is_kept(docs: Path) -> None:
 def test_predictions_are_kept_of_the_lowest_seed_only(docs: Path) -> None:
     kept = docs / "results" / f"{NAMES[0]}-mini"
     assert sorted(path.name for path in (kept / "seed-1").iterdir()) == [
-        "episodes.csv.gz", "evaluations.csv", "probes-best-plus.npz", "probes-end-plus.npz",
+        "episodes.csv.gz", "evaluations.csv", "probes-best-plus.npz", "probes-learn-plus.npz",
         "run.json",
     ]  # fmt: skip
     assert sorted(path.name for path in (kept / "seed-2").iterdir()) == [
@@ -64,7 +64,7 @@ def test_the_page_lists_every_run_and_shows_every_picture(docs: Path) -> None:
         for run in experiment.runs:
             info = run.info
             name = f"| {info.experiment} | mini | {info.seed} |"
-            assert any(f"{name} 3,600 | {info.actions:,} |" in row for row in rows)
+            assert any(f"{name} 3,600 | {run.actions:,} |" in row for row in rows)
             assert any(f"{name} yes | `{info.command}` |" in row for row in rows)
     shown = set(re.findall(r"\]\(images/results/([^)]+)\)", page))
     assert shown == {path.name for path in (docs / "images" / "results").iterdir()}
@@ -79,7 +79,7 @@ def test_keeping_a_seed_again_replaces_it(tmp_path: Path) -> None:
     results.keep([tmp_path / "b"], docs)
     (experiment,) = load([docs / "results"])
     assert experiment.first.commit == "newer"
-    assert [probes.label for probes in experiment.runs[0].probes] == ["end-plus"]
+    assert [probes.label for probes in experiment.runs[0].probes] == ["learn-plus"]
 
 
 def test_too_much_is_refused_before_anything_is_written(

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from experiments.records import EPISODE_COLUMNS, write_csv
 from experiments.runs import load, read_run
 from shared.errors import ConfigError, StateError
 from tests.synthetic_runs import write_probes, write_route, write_run
@@ -66,9 +67,9 @@ def test_samples_by_corridor_are_numbers_for_every_episode(tmp_path: Path) -> No
 def test_routes_and_probes_are_read(folder: Path) -> None:
     write_route(folder / "route-tour.npz", "plus", [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)])
     run = read_run(folder)
-    assert [probes.label for probes in run.probes] == ["best-plus", "end-plus"]
-    (route,) = run.routes
-    assert route.bumps.tolist() == [False, True]
+    assert [probes.label for probes in run.probes] == ["best-plus", "learn-plus"]
+    route = run.routes["tour"]
+    assert route.trace.bumps.tolist() == [False, True]
     assert [event.text for event in route.events] == ["passes the window", "turns"]
 
 
@@ -101,7 +102,7 @@ def test_a_table_with_other_columns_is_refused(folder: Path) -> None:
     ("name", "arrays", "message"),
     [
         ("probes-x.npz", {"images": np.zeros(3)}, "expected an array 'values'"),
-        ("route-x.npz", {"places_m": np.zeros((3, 2))}, "expected places, bumps, world and events"),
+        ("route-x.npz", {"places_m": np.zeros((3, 2))}, r"route-x\.npz: not the route of a drive"),
     ],
 )
 def test_a_file_without_an_array_is_refused(
@@ -126,3 +127,35 @@ def test_a_pickled_array_is_refused(folder: Path) -> None:
     np.savez(folder / "route-bad.npz", places_m=np.array([{}], dtype=object))
     with pytest.raises(StateError, match=r"route-bad\.npz"):
         read_run(folder)
+
+
+def test_the_longest_way_without_a_bump_is_the_run_s_own(tmp_path: Path) -> None:
+    run = read_run(write_run(tmp_path, "plus-rmm", 1))
+    best = length = 0
+    for row in run.episodes.rows:
+        for action in range(int(row["actions"])):
+            bumped = row["bump"] == "1" and action == int(row["actions"]) - 1
+            length = 0 if bumped else length + 1
+            best = max(best, length)
+    assert run.runs_without_bump.max() == best
+
+
+def test_counts_of_a_continued_run_leave_its_predecessor_out(tmp_path: Path) -> None:
+    folder = write_run(tmp_path, "policy-roulette", 1)
+    rows = [dict(row) for row in read_run(folder).episodes.rows]
+    own = read_run(folder)
+    for row in rows:
+        for column in ("total_actions", "train_steps", "longest_run_actions"):
+            row[column] = str(int(row[column]) + 100_000)
+    write_csv(folder / "episodes.csv", EPISODE_COLUMNS, rows)
+    continued = read_run(folder)
+    assert (continued.actions, continued.train_steps) == (own.actions, own.train_steps)
+    assert continued.train_steps == int(rows[-1]["train_steps"]) - 100_000
+
+
+def test_a_stage_that_goes_on_ends_at_the_newest_episode(folder: Path) -> None:
+    path = folder / "run.json"
+    info = json.loads(path.read_text())
+    del info["stages"][0]["last_episode"]
+    path.write_text(json.dumps(info))
+    assert read_run(folder).stages[0].last_episode == 100
