@@ -342,28 +342,52 @@ def experiment(
     raise typer.Exit(commands.run(names, scale, seeds, seed, jobs, out))
 
 
+WorldName = Annotated[
+    str, typer.Argument(help="Name of the world, such as plus, or path of a world file.")
+]
+
+
+@world.command("list")
+def world_list() -> None:
+    """List the worlds that come along and those in the folder worlds/."""
+    worlds = import_role("services.robot_driver.world", "driver")
+    for name, path in worlds.world_files().items():
+        loaded = worlds.read_world(path)
+        x0, y0, x1, y1 = loaded.bounds
+        laps = "laps" if loaded.lap else "no laps"
+        size = f"{x1 - x0:.1f} x {y1 - y0:.1f} m"
+        typer.echo(f"{name:16} {size:14} {laps:8} {path}  {loaded.title}")
+
+
 @world.command("render")
 def world_render(
-    name: Annotated[str, typer.Argument(help="Name of the world, such as plus.")],
+    name: WorldName,
     out: Annotated[Path, typer.Option(help="Folder for the PNG files.")] = Path("renders"),
 ) -> None:
     """Write a top view and camera views of a world as PNG files."""
-    survey = import_role("services.robot_driver.survey", "driver")
-    survey.render(name, out)
+    views = import_role("services.robot_driver.views", "driver")
+    views.render(name, out)
     typer.echo(f"written to {out}")
 
 
 @world.command("check")
 def world_check(
-    name: Annotated[str, typer.Argument(help="Name of the world, such as plus.")],
+    name: WorldName,
     preset: Preset = None,
     config: ConfigFile = None,
     set_: Set = None,
 ) -> None:
-    """Measure a world: lap length, corridor width, turning circle, how many poses can be saved."""
-    loaded = _load(preset, config, set_, others={"robot.world": name})
+    """Print what is wrong with a world (exit code 1), or measure it: how hard it is, laps, tour."""
+    worlds = import_role("services.robot_driver.world", "driver")
     survey = import_role("services.robot_driver.survey", "driver")
-    for key, value in survey.survey(loaded).items():
+    path = worlds.world_path(name)
+    loaded = _load(preset, config, set_, others={"robot.world": path.stem})
+    problems = survey.problems_in(path, loaded)
+    for line in problems:
+        typer.echo(line)
+    if problems:
+        raise typer.Exit(EXIT_CRASH)
+    for key, value in survey.survey(loaded, worlds.read_world(path)).items():
         typer.echo(f"{key:40} {value:.3f}" if isinstance(value, float) else f"{key:40} {value}")
 
 

@@ -10,6 +10,7 @@ called lost might still be saved by a better plan.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -32,7 +33,15 @@ _EXACT_STEP_M = 0.01
 _TABLE_STEPS = 5
 """Points at which the tables look at the way of one action."""
 _DISCOUNT = 0.99
-_LAP_SWEEPS = 250
+_SWEEPS = 250
+_ARRIVAL_M = 1.0
+"""The last part of a route, where a tour has arrived."""
+_CORNER_M = 2.5
+"""Corners of a route may be cut; who gets farther ahead at once has left out a part of it."""
+_ARRIVAL_GAIN = 100.0
+"""Of each action there: worth more than turning back before a dead end."""
+_LOST = -100.0
+"""Value of a run that cannot go on."""
 
 
 @dataclass(frozen=True)
@@ -85,11 +94,18 @@ class Run:
     """[steps + 1, n, 3]; the last one stays when the run ended."""
 
 
-@dataclass(frozen=True)
-class _Lap:
-    """What a racing run follows."""
+Gain = Callable[[Floats, Floats], Floats]
+"""Progress between poses before and after an action: two float64 [n, 3] to float64 [n].
 
-    direction: int
+Minus infinity where the action is not wanted at all.
+"""
+
+
+@dataclass(frozen=True)
+class _Aim:
+    """What a run makes for while it keeps some room."""
+
+    gain: Gain
     keep_m: float
     table: Table
 
@@ -127,7 +143,7 @@ class Planner:
         self._room: Table = room.reshape(rows, columns).astype(np.float32)
         self._way = [self._way_room(action) for action in range(3)]
         self._margin = self._margin_table(horizon)
-        self._laps: dict[tuple[int, float], _Lap] = {}
+        self._aims: dict[tuple[int, float], _Aim] = {}
 
     def drive(self, poses: Floats, actions: int) -> Run:
         """Planned runs that keep most room, from poses float64 [n, 3]."""
@@ -147,10 +163,43 @@ class Planner:
         Raises:
             ValueError: The world has no lap centre.
         """
-        key = direction, keep_m
-        if key not in self._laps:
-            self._laps[key] = _Lap(direction, keep_m, self._lap_table(direction, keep_m))
-        return self._roll_out(pose[None, :], actions, self._laps[key])
+
+        def turned(before: Floats, after: Floats) -> Floats:
+            return direction * _wrap(self._bearing(after) - self._bearing(before))
+
+        return self._pursue(pose, actions, (direction, keep_m), turned)
+
+    def tour(self, actions: int, keep_m: float = 0.005) -> Run:
+        """The planned run along the world's route, from its first point towards its second.
+
+        Args:
+            actions: Length of the run, at most; it may go on beyond the end of the route.
+            keep_m: Room to keep to all walls.
+
+        Raises:
+            ValueError: The world has no route.
+        """
+        track = self._track()
+        (x, y), (ahead_x, ahead_y) = track.points[:2]
+        pose = np.array([x, y, math.atan2(ahead_y - y, ahead_x - x)])
+
+        near_end_m = track.length_m - _ARRIVAL_M
+
+        def advanced(before: Floats, after: Floats) -> Floats:
+            gain = track.along(after) - track.along(before)
+            arrived = track.along(after) > near_end_m
+            follows = np.abs(gain) <= _CORNER_M
+            return np.where(follows, gain + _ARRIVAL_GAIN * arrived, -np.inf)
+
+        return self._pursue(pose, actions, (0, keep_m), advanced)
+
+    def progress(self, poses: Floats) -> Floats:
+        """How far along the world's route poses float64 [n, 3] are, metres, float64 [n].
+
+        Raises:
+            ValueError: The world has no route.
+        """
+        return self._track().along(poses)
 
     def winding(self, poses: Floats) -> Floats:
         """Net angle round the lap centre along float64 [steps, 3], radians, float64 [steps].
@@ -161,14 +210,21 @@ class Planner:
         angle = np.unwrap(self._bearing(poses))
         return np.asarray(angle - angle[0])
 
-    def _roll_out(self, poses: Floats, actions: int, lap: _Lap | None) -> Run:
+    def _pursue(self, pose: Floats, actions: int, key: tuple[int, float], gain: Gain) -> Run:
+        """A run for gain; the key is its direction, 0 along the route, and the room to keep."""
+        if key not in self._aims:
+            keep_m = key[1]
+            self._aims[key] = _Aim(gain, keep_m, self._gain_table(gain, keep_m))
+        return self._roll_out(pose[None, :], actions, self._aims[key])
+
+    def _roll_out(self, poses: Floats, actions: int, aim: _Aim | None) -> Run:
         poses = poses.copy()
         survived = np.zeros(len(poses), np.int64)
         alive = np.arange(len(poses))
         chosen_all, poses_all = [], [poses.copy()]
         for _ in range(actions):
             chosen = np.zeros(len(poses), np.int64)
-            chosen[alive] = self._choose(poses[alive], lap)
+            chosen[alive] = self._choose(poses[alive], aim)
             safe = np.zeros(len(poses), np.bool_)
             for action in range(3):
                 mine = alive[chosen[alive] == action]
@@ -182,7 +238,7 @@ class Planner:
                 break
         return Run(survived, np.array(chosen_all, np.int64), np.array(poses_all))
 
-    def _choose(self, poses: Floats, lap: _Lap | None) -> Ints:
+    def _choose(self, poses: Floats, aim: _Aim | None) -> Ints:
         """The action with most room on its way and after it, or with most progress if safe."""
         scores = []
         for action in range(3):
@@ -190,10 +246,9 @@ class Planner:
             room = np.minimum(
                 self._look_up(self._way[action], poses), self._look_up(self._margin, after)
             )
-            if lap is not None:
-                gain = lap.direction * _wrap(self._bearing(after) - self._bearing(poses))
-                value = gain + _DISCOUNT * self._look_up(lap.table, after)
-                room = np.where(room > lap.keep_m, value, room - 100.0)
+            if aim is not None:
+                value = aim.gain(poses, after) + _DISCOUNT * self._look_up(aim.table, after)
+                room = np.where(room > aim.keep_m, value, room - 100.0)
             scores.append(room)
         return np.asarray(np.argmax(np.stack(scores), axis=0), np.int64)
 
@@ -208,23 +263,28 @@ class Planner:
             table = new
         return table
 
-    def _lap_table(self, direction: int, keep_m: float) -> Table:
-        """Discounted net angle round the lap centre of the best safe run, radians."""
+    def _gain_table(self, gain: Gain, keep_m: float) -> Table:
+        """Discounted gain of the best safe run."""
         before = np.column_stack([self._points, np.zeros(len(self._points))])
         gains = []
         for action in range(3):
-            gain = np.empty_like(self._margin)
+            table = np.empty_like(self._margin)
             for h in range(self._headings):
                 before[:, 2] = h * self._heading_step
-                turned = self._bearing(self.motion.move(before, action)) - self._bearing(before)
-                gain[h] = (direction * _wrap(turned)).reshape(self._room.shape)
+                after = self.motion.move(before, action)
+                table[h] = gain(before, after).reshape(self._room.shape)
             room = np.minimum(self._way[action], self._after(self._margin, action, -1.0))
-            gains.append(np.where(room > keep_m, gain, np.float32(-1.0)))
+            gains.append(np.where(room > keep_m, table, np.float32(-np.inf)))
         table = np.zeros_like(self._margin)
-        for _ in range(_LAP_SWEEPS):
+        for _ in range(_SWEEPS):
             best = [gains[a] + _DISCOUNT * self._after(table, a, 0.0) for a in range(3)]
-            table = np.maximum.reduce(best)
+            table = np.maximum(np.maximum.reduce(best), np.float32(_LOST))
         return table
+
+    def _track(self) -> _Track:
+        if self.world.route is None:
+            raise ValueError(f"world {self.world.name!r} has no route")
+        return _Track(np.array(self.world.route.points, np.float64))
 
     @property
     def _heading_step(self) -> float:
@@ -295,6 +355,29 @@ class Planner:
                         np.floor(x).astype(np.int64) + dx,
                     ]  # fmt: skip
         return result
+
+
+@dataclass(frozen=True)
+class _Track:
+    """A line of straight legs between points float64 [n, 2]."""
+
+    points: Floats
+
+    @property
+    def length_m(self) -> float:
+        """Of all legs."""
+        return float(np.hypot(*np.diff(self.points, axis=0).T).sum())
+
+    def along(self, poses: Floats) -> Floats:
+        """Way from the first point to the place closest to each pose, float64 [n], metres."""
+        start, legs = self.points[:-1], np.diff(self.points, axis=0)
+        lengths = np.hypot(*legs.T)
+        offset = poses[:, None, :2] - start
+        part = np.clip(np.einsum("nlj,lj->nl", offset, legs) / lengths**2, 0.0, 1.0)
+        gaps = np.hypot(*(offset - part[..., None] * legs).transpose(2, 0, 1))
+        leg = gaps.argmin(axis=1)
+        before = np.concatenate([[0.0], np.cumsum(lengths)])
+        return np.asarray(before[leg] + part[np.arange(len(poses)), leg] * lengths[leg])
 
 
 def _wrap(angle_rad: Floats) -> Floats:

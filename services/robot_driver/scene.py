@@ -27,7 +27,7 @@ from shared.config import CameraConfig
 REACH_M = 0.5
 """Walls and obstacles farther away than this are not measured."""
 
-_WALL_THICKNESS_M = 0.1
+WALL_THICKNESS_M = 0.1
 _BUMPER_HEIGHT_M = 0.1
 _BODY_HEIGHT_M = 0.2
 _NEAR_M, _FAR_M = 0.05, 60.0
@@ -231,10 +231,10 @@ def _behind_walls(world: World) -> list[_Solid]:
     for ax, ay, bx, by in world.segments:
         dx, dy = bx - ax, by - ay
         length = math.hypot(dx, dy)
-        back = _WALL_THICKNESS_M / 2 / length
+        back = WALL_THICKNESS_M / 2 / length
         solids.append(
             _Solid(
-                (length / 2, _WALL_THICKNESS_M / 2, world.height_m / 2),
+                (length / 2, WALL_THICKNESS_M / 2, world.height_m / 2),
                 ((ax + bx) / 2 + dy * back, (ay + by) / 2 - dx * back, world.height_m / 2),
                 math.atan2(dy, dx),
             )

@@ -1,6 +1,6 @@
 """Measures a world and a motion together: what can be driven, and how hard it is (A4, E31).
 
-`corridor world check` prints the result of `survey`, `corridor world render` calls `render`.
+`corridor world check` prints the result of `problems_in`, or, if there are none, of `survey`.
 """
 
 from __future__ import annotations
@@ -9,19 +9,20 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from services.robot_driver.inspection import problems
 from services.robot_driver.planner import TURNS, Motion, Planner
 from services.robot_driver.recovery import back_off
 from services.robot_driver.robot import Pose, Velocity
 from services.robot_driver.sim import SimRobot
-from services.robot_driver.views import render
-from services.robot_driver.world import World, load_world
+from services.robot_driver.world import World, WorldError, read_world
 from shared.config import Config
 
-__all__ = ["RandomDrive", "corridor_width", "drive_randomly", "render", "survey"]
+__all__ = ["RandomDrive", "corridor_width", "drive_randomly", "problems_in", "survey"]
 
 Figures = dict[str, float | int | str | bool]
 
@@ -31,6 +32,7 @@ COMFORTABLE_M = 0.4
 """Room to all walls on the lap that stands for an ordinary driving line."""
 _RECOVERIES = 1000
 _RACE_ACTIONS = 600
+_TOUR_HORIZON = 6
 _SPACING_M = 0.1
 """Distance of the places at which the width is measured."""
 
@@ -49,16 +51,23 @@ class RandomDrive:
     """Mean time that simulating one action took, without the camera."""
 
 
-def survey(config: Config) -> Figures:
-    """Measure the configured robot in the configured world; takes about a minute.
+def problems_in(path: Path, config: Config) -> list[str]:
+    """What is wrong with a world file for the configured robot, one line each."""
+    try:
+        world = read_world(path)
+    except WorldError as error:
+        return [str(error)]
+    return problems(world, Motion.of(config.robot))
+
+
+def survey(config: Config, world: World) -> Figures:
+    """Measure the configured robot in a world, about a minute for each hundred square metres.
 
     Returns:
         Named figures: lengths in metres, angles in degrees, times in milliseconds.
 
-    Raises:
-        WorldError: The world is missing or wrong.
     """
-    world, motion = load_world(config.robot.world), Motion.of(config.robot)
+    motion = Motion.of(config.robot)
     robot = SimRobot(config.robot, world, config.run.seed)
     try:
         driven = drive_randomly(robot, _RECOVERIES, config.run.seed)
@@ -71,6 +80,7 @@ def survey(config: Config) -> Figures:
         **_geometry(world, motion),
         **_best_run(planner),
         **_laps(planner),
+        **_tour(world, motion),
         **_random_figures(driven),
         **_saved(planner, driven),
         **pictures,
@@ -164,6 +174,22 @@ def _laps(planner: Planner) -> Figures:
         laps = direction * angle / (2.0 * math.pi)
         figures[name] = survived / laps if laps > 0.5 else math.inf
     return figures
+
+
+def _tour(world: World, motion: Motion) -> Figures:
+    """How much of the route a planned run drives, and in how many actions."""
+    if world.route is None:
+        return {}
+    # A dead end may end the route, so the run need not be able to go on for ever.
+    planner = Planner(world, motion, horizon=_TOUR_HORIZON)
+    length = world.route.length_m
+    run = planner.tour(round(2.0 * length / motion.step_m))
+    driven = planner.progress(run.poses[: int(run.survived[0]) + 1, 0])
+    return {
+        "route_m": length,
+        "route_driven_m": float(driven.max()),
+        "route_driven_actions": int(driven.argmax()),
+    }
 
 
 def _centre_line_lap(world: World) -> float:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from services.robot_driver.robot import Pose
 from services.robot_driver.scene import Scene
-from services.robot_driver.world import World, load_world
+from services.robot_driver.world import Obstacle, Route, World, load_world
 from shared.config import RobotConfig
 from shared.rl.preprocess import preprocess
 
@@ -26,13 +26,14 @@ _SOLID: Colour = (206, 206, 202)
 _FREE: Colour = (247, 246, 242)
 _ROBOT: Colour = (44, 110, 190)
 _LAP: Colour = (200, 60, 50)
+_ROUTE: Colour = (40, 140, 80)
 
 
 def render(name: str, out: Path) -> None:
     """Write `map.png`, `view-*.png` (640x360) and `image-*.png` (what the network sees, enlarged).
 
     Args:
-        name: One of the worlds that come with the driver.
+        name: Of the world, or the path of its file.
         out: Folder, made if missing.
 
     Raises:
@@ -74,7 +75,7 @@ def viewpoints(world: World, count: int = 8) -> list[Pose]:
 
 
 def draw_map(world: World, radius_m: float, poses: list[Pose]) -> Picture:
-    """The world from above: walls in the colour of their texture, starts, lap line, scale."""
+    """The world from above: walls in their texture's colour, obstacles, route, starts, lap line."""
     sheet = _Sheet(world)
     for wall in world.walls:
         sheet.fill(wall.points, _FREE if wall.area_m2 > 0.0 else _SOLID)
@@ -84,8 +85,17 @@ def draw_map(world: World, radius_m: float, poses: list[Pose]) -> Picture:
             rgb = texture.accent if texture.kind == "plaster" else texture.rgb
             sheet.line((ax, ay), (bx, by), rgb, 9)
     _draw_fixtures(sheet, world)
-    for start in world.starts:
-        sheet.robot(Pose(start.x_m, start.y_m, math.radians(start.heading_deg)), radius_m)
+    for obstacle in world.obstacles:
+        corners = tuple((float(x), float(y)) for x, y in obstacle.corners)
+        sheet.fill(corners, obstacle.rgb)
+        sheet.outline(corners, _INK)
+        sheet.label((obstacle.x_m, obstacle.y_m), obstacle.name, _off_walls(world, obstacle))
+    if world.route is not None:
+        _draw_route(sheet, world.route)
+    for i, start in enumerate(world.starts):
+        pose = Pose(start.x_m, start.y_m, math.radians(start.heading_deg))
+        sheet.robot(pose, radius_m)
+        sheet.label(_ahead(pose, -radius_m - 0.1), f"S{i}", (0.0, 0.0), _ROBOT)
     if world.lap is not None:
         sheet.line(*world.lap.line, _LAP, 3)
         (x, y), (x2, y2) = world.lap.line
@@ -116,19 +126,39 @@ class _Sheet:
         corners = np.array([self.at(*point) for point in points], np.int32)
         cv2.fillPoly(self.pixels, [corners], rgb, cv2.LINE_AA)
 
+    def outline(self, points: tuple[tuple[float, float], ...], rgb: Colour) -> None:
+        """The edge of a polygon."""
+        corners = np.array([self.at(*point) for point in points], np.int32)
+        cv2.polylines(self.pixels, [corners], True, rgb, 1, cv2.LINE_AA)
+
     def line(
         self, a: tuple[float, float], b: tuple[float, float], rgb: Colour, width_px: int
     ) -> None:
         """A straight line."""
         cv2.line(self.pixels, self.at(*a), self.at(*b), rgb, width_px, cv2.LINE_AA)
 
-    def dot(self, place: tuple[float, float], rgb: Colour) -> None:
-        """A small disc."""
-        cv2.circle(self.pixels, self.at(*place), 5, rgb, -1, cv2.LINE_AA)
+    def dot(self, place: tuple[float, float], rgb: Colour, radius_px: int = 5) -> None:
+        """A disc."""
+        cv2.circle(self.pixels, self.at(*place), radius_px, rgb, -1, cv2.LINE_AA)
 
     def text(self, place: tuple[float, float], words: str, rgb: Colour = _INK) -> None:
         """Words that begin at a place."""
         _put(self.pixels, self.at(*place), words, rgb)
+
+    def label(
+        self,
+        place: tuple[float, float],
+        words: str,
+        way: tuple[float, float],
+        rgb: Colour = _INK,
+    ) -> None:
+        """Words beside a place, in direction `way` from it (metres; right and up), with a rim."""
+        (w, h), _ = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1)
+        column, row = self.at(place[0] + way[0], place[1] + way[1])
+        column += round((np.sign(round(way[0], 6)) - 1) * w / 2)
+        row += round((1 - np.sign(round(way[1], 6))) * h / 2)
+        _put(self.pixels, (column, row), words, _FREE, 0.45, 4)
+        _put(self.pixels, (column, row), words, rgb, 0.45)
 
     def robot(self, pose: Pose, radius_m: float) -> None:
         """The round shell with an arrow along its heading."""
@@ -154,7 +184,7 @@ class _Sheet:
             cv2.rectangle(self.pixels, (left, row - 6), (left + PIXELS_PER_M, row + 6), rgb, -1)
             cv2.rectangle(self.pixels, (left, row - 6), (left + PIXELS_PER_M, row + 6), _INK, 1)
         _put(self.pixels, (_MARGIN_PX + 2 * PIXELS_PER_M + 12, row + 6), "2 m", _INK)
-        note = "circle and arrow: start   number: viewpoint   red: lap line and centre"
+        note = "S: start   number: viewpoint   red: lap line and centre   green: route, its places"
         _put(self.pixels, (_MARGIN_PX + 4 * PIXELS_PER_M, row + 6), note, _INK, 0.5)
 
 
@@ -169,9 +199,26 @@ def _draw_fixtures(sheet: _Sheet, world: World) -> None:
         ends = [(ax + ux * s + uy * 0.06, ay + uy * s - ux * 0.06) for s in (near, far)]
         sheet.line(ends[0], ends[1], fixture.rgb, 10)
         if fixture.kind != "radiator":
-            side = 0.3 if ux * uy == 0 and abs(uy) > 0.5 else 0.2
-            middle = (ax + ux * fixture.at_m + uy * side, ay + uy * fixture.at_m - ux * side)
-            _put_centred(sheet.pixels, sheet.at(*middle), fixture.kind)
+            middle = (ax + ux * fixture.at_m, ay + uy * fixture.at_m)
+            sheet.label(middle, fixture.name or fixture.kind, (0.16 * uy, -0.16 * ux))
+
+
+def _draw_route(sheet: _Sheet, route: Route) -> None:
+    """A dotted line, and its places as rings with their names."""
+    for x, y in route.sample(0.2):
+        sheet.dot((float(x), float(y)), _ROUTE, 2)
+    for place in route.places:
+        sheet.dot((place.x_m, place.y_m), _ROUTE)
+        sheet.label((place.x_m, place.y_m), place.name, (0.0, 0.1), _ROUTE)
+
+
+def _off_walls(world: World, obstacle: Obstacle) -> tuple[float, float]:
+    """Way from an obstacle's middle to where its name can be read: towards more room."""
+    x, y = np.ptp(obstacle.corners, axis=0) / 2 + 0.05
+    ways = np.array([(0.0, y), (0.0, -y), (x, 0.0), (-x, 0.0)])
+    room = world.clearance(np.array([[obstacle.x_m, obstacle.y_m]]) + 1.5 * ways)
+    way = ways[int(np.argmax(room))]
+    return float(way[0]), float(way[1])
 
 
 def _ahead(pose: Pose, distance_m: float) -> tuple[float, float]:
@@ -181,13 +228,15 @@ def _ahead(pose: Pose, distance_m: float) -> tuple[float, float]:
     )
 
 
-def _put(pixels: Picture, at: tuple[int, int], words: str, rgb: Colour, size: float = 0.55) -> None:
-    cv2.putText(pixels, words, at, cv2.FONT_HERSHEY_SIMPLEX, size, rgb, 1, cv2.LINE_AA)
-
-
-def _put_centred(pixels: Picture, at: tuple[int, int], words: str) -> None:
-    (w, h), _ = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1)
-    _put(pixels, (at[0] - w // 2, at[1] + h // 2), words, _INK, 0.45)
+def _put(
+    pixels: Picture,
+    at: tuple[int, int],
+    words: str,
+    rgb: Colour,
+    size: float = 0.55,
+    width_px: int = 1,
+) -> None:
+    cv2.putText(pixels, words, at, cv2.FONT_HERSHEY_SIMPLEX, size, rgb, width_px, cv2.LINE_AA)
 
 
 def _write(path: Path, picture: Picture) -> None:

@@ -50,7 +50,7 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
         assert f" {name} " in shown
 
 
-@pytest.mark.parametrize("command", [*COMMANDS, "world render", "world check"])
+@pytest.mark.parametrize("command", [*COMMANDS, "world list", "world render", "world check"])
 def test_every_command_and_option_has_a_help_text(
     command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,7 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.robot_driver.world import WORLDS, Obstacle, World, WorldError, load_world, read_world
+from services.robot_driver.world import (
+    WORLDS,
+    Obstacle,
+    World,
+    WorldError,
+    load_world,
+    read_world,
+    world_files,
+)
 
 PLUS = (WORLDS / "plus.toml").read_text(encoding="utf-8")
 
@@ -296,3 +304,37 @@ def test_two_places_of_one_name_are_refused(tmp_path: Path):
     place = ROUTE[ROUTE.index("[[route.places]]") :]
     with pytest.raises(WorldError, match=r"route.places: two are named 'east'"):
         with_route(tmp_path, ROUTE + place)
+
+
+def own_world(folder: Path, name: str) -> Path:
+    (folder / "worlds").mkdir(exist_ok=True)
+    path = folder / "worlds" / f"{name}.toml"
+    path.write_text(PLUS.replace('name = "plus"', f'name = "{name}"'), encoding="utf-8")
+    return path
+
+
+def test_a_file_in_the_folder_worlds_is_a_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    before = list(world_files())
+    assert {"plus", "minus", "i16c"} <= set(before)
+    own_world(tmp_path, "attic")
+    assert list(world_files()) == [*before, "attic"]
+    assert load_world("attic").walls == load_world("plus").walls
+    with pytest.raises(WorldError, match="there are: i16c, minus, plus, attic"):
+        load_world("cellar")
+
+
+def test_a_world_can_be_named_by_the_path_of_its_file(tmp_path: Path):
+    path = own_world(tmp_path, "attic")
+    assert load_world(str(path)).name == "attic"
+    with pytest.raises(WorldError, match=r"cellar\.toml"):
+        load_world(str(tmp_path / "cellar.toml"))
+
+
+def test_own_worlds_do_not_take_the_names_of_those_that_come_along(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    own_world(tmp_path, "plus")
+    with pytest.raises(WorldError, match=r"plus\.toml: a world named 'plus' comes along"):
+        load_world("plus")
