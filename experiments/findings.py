@@ -90,11 +90,12 @@ def same_start(experiments: Sequence[Experiment]) -> list[str]:
     fills: dict[int, set[str]] = {}
     for experiment in experiments:
         for run in experiment.runs:
-            fills.setdefault(run.info.seed, set()).add(run.info.prefill)
+            if run.info.prefill:
+                fills.setdefault(run.info.seed, set()).add(run.info.prefill)
     differ = [str(seed) for seed, prefills in sorted(fills.items()) if len(prefills) > 1]
     if differ:
         return [f"The memories did not begin equal in seed {', '.join(differ)}."]
-    return ["Of every seed, the memory began equal in all of them."]
+    return ["Of every seed, the memory began equal in all of them."] if fills else []
 
 
 def loss(experiment: Experiment) -> list[str]:

@@ -64,7 +64,7 @@ class RunInfo(_Record):
     factor: float = Field(gt=0.0)
     """How many times fewer episodes and samples than in the thesis; 1 at full scale."""
     seed: int
-    after: str
+    after: str = ""
     """The experiment whose end this one began with; empty for none."""
     command: str
     commit: str
@@ -75,10 +75,14 @@ class RunInfo(_Record):
     finished: str
     """Empty while the run goes on."""
     seconds: float
+    actions: int
+    """So far, predecessors included."""
+    train_steps: int
+    """Likewise."""
     complete: bool
-    prefill: str
-    """Hash of the memory as the first episode began."""
-    first_lap: dict[str, float]
+    prefill: str = ""
+    """Hash of the memory as the first episode began; empty for what keeps no such memory."""
+    first_lap: dict[str, float] = Field(default_factory=dict)
     """When the frozen network first drove a lap; empty if it has not, or nobody looked."""
     stages: tuple[StageInfo, ...]
     thesis: dict[str, Any]
@@ -140,15 +144,20 @@ class Run:
 
     @property
     def actions(self) -> int:
-        """Actions of this run's own episodes; columns and evaluations count predecessors too."""
+        """Actions of this run's own episodes; `run.json` and evaluations count predecessors too.
+
+        A baseline records no episodes and has no predecessors: what `run.json` says.
+        """
+        if not len(self.episodes):
+            return self.info.actions
         return int(np.nansum(self.episodes.numbers("actions")))
 
     @property
     def train_steps(self) -> int:
-        """Gradient steps from the run's second episode on, and the mini-batches of its first."""
+        """Gradient steps of this run alone: those since its first episode, and that one's."""
         steps = self.episodes.numbers("train_steps")
         if not len(steps):
-            return 0
+            return self.info.train_steps
         return int(steps[-1] - steps[0] + self.episodes.numbers("mini_batches")[0])
 
     @cached_property

@@ -413,9 +413,6 @@ def report(
     typer.echo(f"written: {pages[0]} and {len(pages) - 1} Markdown pages beside it")
 
 
-# ---------------------------------------------------------------- experiments
-
-
 @app.command()
 def evaluate(
     run: Annotated[
