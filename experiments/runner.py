@@ -253,6 +253,7 @@ class Run:
     def _refer(self) -> None:
         """Record floor and ceiling of all worlds that were driven in, at the end of the record."""
         settings, kept = self.plan.evaluation, self.folder.parents[1] / "references"
+        path, columns = self.folder / "evaluations.csv", records.EVALUATION_COLUMNS
         rows = [
             self._evaluation_row(
                 "reference",
@@ -260,10 +261,10 @@ class Run:
                 world,
                 reference(self._looker(world), driver, settings.starts, settings.actions, kept),
             )
-            for world in sorted(self._lookers)
+            for world in sorted({row["world"] for row in records.read_csv(path, columns)})
             for driver in DRIVERS
         ]
-        records.append_csv(self.folder / "evaluations.csv", records.EVALUATION_COLUMNS, rows)
+        records.append_csv(path, columns, rows)
 
     def _evaluation_row(self, label: str, driver: str, world: str, figures: Figures) -> records.Row:
         counters = self._loop.counters
