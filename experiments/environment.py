@@ -129,6 +129,12 @@ class CorridorEnv(gymnasium.Env[Image, np.int64]):
         """The world the robot is in, with the obstacles that stand there now."""
         return self.robot.world.model_copy(update={"obstacles": self.robot.obstacles})
 
+    def turn(self, left: bool) -> Observation:
+        """Turn on the spot for the time of one action, which is none of the three, and look."""
+        self.driver.start_turn(left)
+        self.driver.settle(self.driver.advance(self.config.robot.period_s))
+        return self.observe()
+
     def observe(self) -> Observation:
         """Sense now, as after a change of the world that was no action."""
         self._seen = self.driver.observe()

@@ -110,6 +110,13 @@ class Driver:
         self._drive(self.safety.allow(action_velocity(self._config, action), self._robot.now_s()))
         self.state = "driving"
 
+    def start_turn(self, left: bool) -> None:
+        """Begin to turn on the spot, within the limits (A45)."""
+        turn_rad_s = math.copysign(self._config.robot.turn_rad_s, 1.0 if left else -1.0)
+        velocity = Velocity(0.0, 0.0, turn_rad_s)
+        self._drive(self.safety.allow(velocity, self._robot.now_s()))
+        self.state = "driving"
+
     def advance(self, duration_s: float) -> bool:
         """Let time pass; True at contact, where the robot has already stopped (unless `none`)."""
         stop = self._config.robot.recovery != "none"

@@ -1,0 +1,213 @@
+"""The test drive through I16c: image only, with rotation in place (A45, Fig 4.20, E33).
+
+The network is frozen and acts greedily. Where the reward predicted for its action is negative, the
+robot turns on the spot instead: to the left for forward/left, else to the right, and on in that
+direction until an action with a prediction of 0 or more comes up. At a junction towards the end a
+box is dropped in front of the robot.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from experiments.choosers import GREEDY, Predicts
+from experiments.environment import CorridorEnv
+from experiments.routes import Event, Route
+from experiments.traces import Trace
+from services.robot_driver.robot import Pose
+from services.robot_driver.world import World
+from shared.messages import Box, Observation, WorldChange, image_array
+from shared.rl.draws import generator
+from shared.rl.policy import FORWARD_LEFT, choose
+
+DRIVEN = 300
+"""Actions of a full tour, turns on the spot not counted."""
+ROUTE_SHARE, BRIDGES = 0.6, 2
+"""Of the route's length, and how many bridges, a full tour comes along."""
+DROP_AFTER = 200
+"""Driven actions after which the next junction counts as the last one."""
+NEAR_M = 1.0
+"""A place is passed within this distance."""
+BOX_AHEAD_M = 1.1
+
+MOST_TURNING_RAD = math.radians(720.0)
+"""A robot that finds no way out after two full turns drives on regardless (E33)."""
+ROLE = "tour"
+
+
+@dataclass(frozen=True)
+class Tour:
+    """What happened on one test drive."""
+
+    route: Route
+    driven: int
+    turned: int
+    """Turns on the spot, each of one action's duration."""
+    route_share: float
+    bridges: tuple[str, ...]
+    box_dropped: bool
+
+    @property
+    def bumps(self) -> int:
+        """Bumps of the whole drive."""
+        return int(self.route.trace.bumps.sum())
+
+    @property
+    def passed(self) -> bool:
+        """A full tour without a bump, past the box."""
+        full = self.driven >= DRIVEN and self.route_share >= ROUTE_SHARE
+        return full and len(self.bridges) >= BRIDGES and self.box_dropped and not self.bumps
+
+
+@dataclass
+class _Log:
+    """Poses, bumps and events so far."""
+
+    poses: list[tuple[float, float, float]]
+    bumps: list[bool] = field(default_factory=list)
+    driven: list[bool] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+
+    def tell(self, text: str) -> None:
+        self.events.append(Event(len(self.events) + 1, len(self.bumps), text))
+
+    def add(self, pose: Pose, *, bump: bool, driven: bool) -> None:
+        self.poses.append((pose.x_m, pose.y_m, pose.heading_rad))
+        self.bumps.append(bump)
+        self.driven.append(driven)
+
+
+def drive_tour(env: CorridorEnv, network: Predicts, pose: Pose, number: int) -> Tour:
+    """One test drive of `DRIVEN` actions from a pose, in a world with a route.
+
+    Args:
+        env: Its obstacles stay as they were found: the box is taken away again.
+        network: Frozen.
+        pose: Where to begin, standing.
+        number: Seeds draws between equal predictions, and recoveries.
+
+    Raises:
+        ValueError: The world has no route, or the pose is inside a wall.
+    """
+    world = env.robot.world
+    if world.route is None:
+        raise ValueError(f"world {world.name!r} has no route")
+    observation: Observation = env.reset(seed=number, options={"pose": pose})[1]["observation"]
+    log = _Log([(pose.x_m, pose.y_m, pose.heading_rad)])
+    dropped = False
+    draw = generator(number, ROLE)
+    left = turned_rad = 0.0
+    turn_rad = env.config.robot.turn_rad_s * env.config.robot.period_s
+    while sum(log.driven) < DRIVEN and len(log.bumps) < 4 * DRIVEN:
+        _tell_passed(world, log)
+        if not dropped and sum(log.driven) >= DROP_AFTER and _at_junction(world, env.robot.pose):
+            dropped = _drop_box(env, log)
+            observation = env.observe()
+        values = network.all_values(image_array(observation.image)[None])[0]
+        action, _ = choose(values, GREEDY, draw)
+        if values[action] < 0.0 and turned_rad < MOST_TURNING_RAD:
+            if not left:
+                left = 1.0 if action == FORWARD_LEFT else -1.0
+                log.tell(f"turns {'left' if left > 0.0 else 'right'} on the spot")
+            observation = env.turn(left > 0.0)
+            turned_rad += turn_rad
+            log.add(env.robot.pose, bump=False, driven=False)
+            continue
+        left = turned_rad = 0.0
+        _, _, bumped, _, info = env.step(np.int64(action))
+        if bumped:
+            _, info = env.reset()
+            log.tell("bumps")
+        observation = info["observation"]
+        log.add(env.robot.pose, bump=bumped, driven=True)
+    if dropped:
+        env.robot.remove(BOX_NAME)
+    return _tour(env, log, dropped)
+
+
+BOX_NAME = "dropped-box"
+
+
+def route_share(world: World, places_m: npt.NDArray[np.float64], near_m: float = NEAR_M) -> float:
+    """Part of the route's length along which the robot came, places float64 [n, 2]."""
+    assert world.route is not None
+    line = world.route.sample(0.1)
+    gaps = np.hypot(*(line[:, None] - places_m[None]).transpose(2, 0, 1)).min(axis=1)
+    return float(np.mean(gaps <= near_m))
+
+
+def _tour(env: CorridorEnv, log: _Log, dropped: bool) -> Tour:
+    world, poses = env.robot.world, np.array(log.poses)
+    way_m = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+    laps = env.robot.laps
+    trace = Trace(
+        world=world.name,
+        bumps=np.array(log.bumps, np.bool_),
+        places_m=poses[:, :2],
+        headings_rad=poses[:, 2],
+        way_m=way_m,
+        laps_left=laps.left,
+        laps_right=laps.right,
+    )
+    assert world.route is not None
+    bridges = tuple(
+        place.name
+        for place in world.route.places
+        if place.kind == "bridge" and _nearest_m(poses, place.x_m, place.y_m) <= NEAR_M
+    )
+    driven = sum(log.driven)
+    return Tour(
+        Route(trace, tuple(log.events)),
+        driven,
+        len(log.driven) - driven,
+        route_share(world, poses[:, :2]),
+        bridges,
+        dropped,
+    )
+
+
+def _nearest_m(poses: npt.NDArray[np.float64], x_m: float, y_m: float) -> float:
+    return float(np.hypot(poses[:, 0] - x_m, poses[:, 1] - y_m).min())
+
+
+def _tell_passed(world: World, log: _Log) -> None:
+    """Note named places the first time the robot comes past them."""
+    assert world.route is not None
+    x, y, _ = log.poses[-1]
+    told = {event.text for event in log.events}
+    for place in world.route.places:
+        text = f"at {place.name}"
+        if text not in told and math.hypot(place.x_m - x, place.y_m - y) <= NEAR_M / 2:
+            log.tell(text)
+
+
+def _at_junction(world: World, pose: Pose) -> bool:
+    assert world.route is not None
+    return any(
+        place.kind == "junction"
+        and math.hypot(place.x_m - pose.x_m, place.y_m - pose.y_m) <= NEAR_M
+        for place in world.route.places
+    )
+
+
+def _drop_box(env: CorridorEnv, log: _Log) -> bool:
+    """Drop the box across the robot's way; False where a wall leaves no place for it."""
+    pose = env.robot.pose
+    box = Box(
+        name=BOX_NAME,
+        x_m=pose.x_m + BOX_AHEAD_M * math.cos(pose.heading_rad),
+        y_m=pose.y_m + BOX_AHEAD_M * math.sin(pose.heading_rad),
+        heading_deg=math.degrees(pose.heading_rad),
+        length_m=0.3,
+        width_m=0.6,
+        height_m=0.9,
+        rgb=(190, 60, 40),
+    )
+    done = env.driver.change(WorldChange(kind="place", box=box), at_once=True)
+    if done.accepted:
+        log.tell("a box drops in front of the robot")
+    return done.accepted
