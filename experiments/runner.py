@@ -29,7 +29,7 @@ from experiments.traces import Figures, first_lap
 from services.robot_driver.sim import SimRobot
 from services.robot_driver.world import load_world
 from shared.config import Config
-from shared.errors import StateError
+from shared.errors import ConfigError, StateError
 from shared.messages import WorldChange
 from shared.numerics import settle
 from shared.rl.network import to_bytes
@@ -168,19 +168,21 @@ class Run:
         loop, episode = self._loop, self._loop.counters.episode
         before = loop.config
         loop.reconfigure(config)
-        driver = loop.env.driver
         if config.robot.world != loop.env.robot.world.name:
             switch = WorldChange(kind="switch", world=config.robot.world, at_episode=episode)
-            driver.change(switch)
+            self._change(switch)
         for change in stage.changes:
             at = self._offset + int(change["at_episode"])
-            driver.change(WorldChange.model_validate({**change, "at_episode": at}))
+            self._change(WorldChange.model_validate({**change, "at_episode": at}))
         if stage.force_candidates:
             loop.memory.force_candidates(loop.memory.ids)
-        if not self._totals.stages or before.memory.threshold_percent != (
-            config.memory.threshold_percent
-        ):
+        first = (
+            not self._totals.stages
+        )  # both change on the way: a stage sets them where it says so
+        if first or before.memory.threshold_percent != config.memory.threshold_percent:
             loop.threshold_percent = config.memory.threshold_percent
+        if first or before.memory.capacity != config.memory.capacity:
+            loop.memory.set_capacity(config.memory.capacity)
         self._totals.stages.append(
             {
                 "name": stage.name,
@@ -191,6 +193,12 @@ class Run:
                 "first_second": self._totals.seconds,
             }
         )
+
+    def _change(self, wish: WorldChange) -> None:
+        """Raises ConfigError when the driver refuses."""
+        answer = self._loop.env.driver.change(wish)
+        if not answer.accepted:
+            raise ConfigError(f"plan {self.plan.name}: {wish.kind}: {answer.reason}")
 
     def _advance(self, done: TurnDone) -> bool:
         """Evaluate and go on to the next stage where due; whether the plan is at its end."""

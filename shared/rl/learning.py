@@ -191,7 +191,9 @@ class Trainer:
         """Which samples of a mini-batch to look at in a mirror: by chance, half of them."""
         return draw.random(count) < 0.5 if self._learning.augmentation == "mirror" else None
 
-    def _set_gradients(self, batches: Batches, ranks: Ranks, mirrored: Mask | None) -> Tensor:
+    def _set_gradients(
+        self, batches: Batches, ranks: Ranks, mirrored: Mask | None = None
+    ) -> Tensor:
         """Put the gradient of a mini-batch where the optimiser looks; returns the loss.
 
         Each thread takes one share of the mini-batch, and the shares are added up in order: the

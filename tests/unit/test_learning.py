@@ -50,9 +50,11 @@ class Recorder(Trainer):
     def __init__(self, **learning: Any) -> None:
         super().__init__(SMALL, LearningConfig(**learning), Numerics(batch=16), 1)
         self.ranks: list[list[int]] = []
+        self.mirrored: list[Any] = []
 
-    def step(self, samples: SampleStore, ranks: Any) -> float:
+    def step(self, samples: SampleStore, ranks: Any, mirrored: Any = None) -> float:
         self.ranks.append([int(r) for r in ranks])
+        self.mirrored.append(mirrored)
         return 0.0
 
 
@@ -388,6 +390,48 @@ def test_shares_of_several_threads_add_up_to_the_mini_batch(precision: Any) -> N
     for gradients in (two, *others):
         for own, expected in zip(gradients, alone, strict=True):
             assert float((own - expected).norm()) <= bound * float(expected.norm())
+
+
+def flipped(store: SampleStore, which: list[int]) -> SampleStore:
+    """A store in which some samples are what they would be in a mirror."""
+    images = store.images(np.arange(len(store)))
+    images[which] = images[which, :, ::-1]
+    rows = store.rows.copy()
+    for rank in which:
+        rows["action"][rank] = {0: 0, 1: 2, 2: 1}[int(rows["action"][rank])]
+    mirrored = SampleStore()
+    mirrored.append(rows, images)
+    return mirrored
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_a_mirrored_sample_trains_like_one_of_a_mirrored_corridor(threads: int) -> None:
+    store, ranks, which = make_store(7), np.array([6, 0, 3, 5, 2]), [0, 2, 3]
+    trainers = [
+        Trainer(SMALL, LearningConfig(), LearnerNumerics(threads=threads), 1) for _ in range(2)
+    ]
+    ours = trainers[0].step(store, ranks, np.isin(ranks, which))
+    assert ours == trainers[1].step(flipped(store, which), ranks)
+    for own, other in zip(
+        trainers[0].train_network.parameters(), trainers[1].train_network.parameters(), strict=True
+    ):
+        assert torch.equal(own, other)
+
+
+def test_half_of_all_samples_are_mirrored_by_chance_where_that_is_wanted() -> None:
+    settings_of = {"fit_every": 2, "mini_batches_per_episode": 3, "fit_epochs": 2}
+    store, plain = make_store(300), Recorder(**settings_of)
+    ours, again = (Recorder(augmentation="mirror", **settings_of) for _ in range(2))
+    for trainer in (plain, ours, again):
+        for episode in (1, 2):
+            list(trainer.learn(store, episode))
+    assert plain.mirrored == [None] * 9
+    assert ours.ranks == plain.ranks  # the choice of samples stays what it is
+    assert [len(mask) for mask in ours.mirrored] == [len(ranks) for ranks in ours.ranks]
+    for one, other in zip(ours.mirrored, again.mirrored, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert 0.4 < np.concatenate(ours.mirrored).mean() < 0.6
+    assert any((a != b).any() for a, b in zip(ours.mirrored[:3], ours.mirrored[1:3], strict=False))
 
 
 def test_a_share_that_fails_is_heard_of() -> None:
