@@ -64,7 +64,7 @@ class Evaluation(Section):
     starts: Annotated[int, Field(ge=1, le=1000)] = 16
     """At the end of a stage."""
     actions: Annotated[int, Field(ge=50, le=100_000)] = 400
-    every_actions: Annotated[int, Field(ge=1)] = 100_000
+    every_actions: Annotated[int, Field(ge=1)] = 200_000
     """On the way: how often."""
     every_starts: Annotated[int, Field(ge=1, le=1000)] = 8
     every_length: Annotated[int, Field(ge=50, le=100_000)] = 200
