@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from matplotlib.text import Annotation
 
 from experiments import routes
 from experiments.routes import Event, Route
@@ -87,3 +88,10 @@ def test_pictures_show_way_and_bumps_on_the_map(tmp_path: Path) -> None:
         return int(((r > 200) & (abs(g - 94) < 20) & (b < 30)).sum())
 
     assert orange(one) > orange(none) + 20
+
+
+def test_events_stand_as_numbers_on_the_map() -> None:
+    events = (Event(1, 0, "begins"), Event(2, 3, "ends"))
+    (axes,) = routes.figure(load_world("plus"), [DRIVE], "Plus", events).axes
+    marks = [mark for mark in axes.texts if isinstance(mark, Annotation)]
+    assert [(mark.get_text(), mark.xy) for mark in marks] == [("1", (3.8, 0.0)), ("2", (4.1, 0.1))]
