@@ -222,6 +222,19 @@ class LearningConfig(Section):
     one direction of a corridor then helps in the other."""
     target_rule: Literal["bump", "episode"] = "episode"
     """Copy train to target after episodes with a bump (paper, A26) or after every one (E15)."""
+    target_average: bool = False
+    """Copy not the newest weights but the mean of those after each step of the last epoch of a
+    fitting phase, or of the episode's mini-batches: it drives more steadily than any of them. With
+    target_rule 'episode' only."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.target_average and self.target_rule != "episode":
+            raise ValueError(
+                f"learning.target_average needs learning.target_rule 'episode', got "
+                f"{self.target_rule!r}"
+            )
+        return self
 
 
 class Numerics(Section):

@@ -57,6 +57,9 @@ class Trainer:
         )
         self._in_a_share = numerics.model_copy(update={"threads": 1})
         self._pool = ThreadPoolExecutor(max(1, numerics.threads), "share of a mini-batch")
+        self._mean: list[Tensor] = []
+        self._in_mean = 0
+        """Of the weights after so many steps; begins anew with each epoch and each episode."""
         self.train_steps = 0
         self.fits = 0
         self.version = 1
@@ -75,6 +78,7 @@ class Trainer:
 
         A fitting phase when due, else `mini_batches_per_episode` steps.
         """
+        self._in_mean = 0
         if not len(samples):
             return
         if due(episode, self._learning.fit_every):
@@ -94,6 +98,9 @@ class Trainer:
         if self.train_steps == self.steps_at_copy:
             return False
         self.target_network.load_state_dict(self.train_network.state_dict())
+        if self._in_mean:
+            for own, mean in zip(self.target_network.parameters(), self._mean, strict=True):
+                own.copy_(mean)
         self.steps_at_copy = self.train_steps
         self.version += 1
         return True
@@ -181,6 +188,7 @@ class Trainer:
 
     def _shuffled(self, count: int, episode: int) -> Iterator[tuple[int, Ranks, Mask | None]]:
         for epoch in range(self._learning.fit_epochs):
+            self._in_mean = 0
             draw = generator(self._seed, "fit", episode, epoch)
             order = draw.permutation(count)
             for start in range(0, count, self._learning.batch_size):
@@ -237,7 +245,19 @@ class Trainer:
     def _apply_gradients(self) -> None:
         with arithmetic(self._numerics):
             self._optimiser.step()
+            if self._learning.target_average:
+                self._take_into_mean()
         self.train_steps += 1
+
+    @torch.no_grad()
+    def _take_into_mean(self) -> None:
+        weights = [parameter.detach() for parameter in self.train_network.parameters()]
+        self._in_mean += 1
+        if self._in_mean == 1:
+            self._mean = [weight.clone() for weight in weights]
+        else:
+            for mean, weight in zip(self._mean, weights, strict=True):
+                mean.lerp_(weight, 1.0 / self._in_mean)
 
     def _checked(self, loss: float) -> float:
         """Raise FloatingPointError for a loss that is not finite."""

@@ -434,6 +434,43 @@ def test_half_of_all_samples_are_mirrored_by_chance_where_that_is_wanted() -> No
     assert any((a != b).any() for a, b in zip(ours.mirrored[:3], ours.mirrored[1:3], strict=False))
 
 
+@pytest.mark.parametrize("episode", [1, 2])
+def test_the_target_can_be_the_mean_over_the_newest_steps(episode: int) -> None:
+    """Of an episode's mini-batches, or of the last epoch of a fitting phase."""
+    settings_of = {"fit_every": 2, "mini_batches_per_episode": 3, "fit_epochs": 2}
+    store = make_store(40)
+    trainer = make_trainer(target_average=True, batch_size=16, **settings_of)
+    newest = [
+        (trained.epoch, parameters(trainer.train_network))
+        for trained in trainer.learn(store, episode)
+    ]
+    assert trainer.apply_target_rule(episode, bump=False)
+    seen = [weights for epoch, weights in newest if epoch == newest[-1][0]]
+    assert len(seen) == 3
+    for name, found in parameters(trainer.target_network).items():
+        mean = np.mean([weights[name].astype(np.float64) for weights in seen], axis=0)
+        np.testing.assert_allclose(found, mean, rtol=1e-5, atol=1e-7)
+    untouched = parameters(trainer.train_network)
+    for name, last in seen[-1].items():
+        np.testing.assert_array_equal(untouched[name], last)
+
+
+def test_the_mean_begins_anew_with_each_episode() -> None:
+    store = make_store(40)
+    trainer = make_trainer(target_average=True, batch_size=16, mini_batches_per_episode=1)
+    for episode in (1, 3):
+        list(trainer.learn(store, episode))
+        trainer.apply_target_rule(episode, bump=True)
+        target = parameters(trainer.target_network)
+        for name, weights in parameters(trainer.train_network).items():
+            np.testing.assert_array_equal(target[name], weights)
+
+
+def test_a_mean_over_several_episodes_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"learning\.target_average needs learning\.target_rule"):
+        LearningConfig(target_average=True, target_rule="bump")
+
+
 def test_a_share_that_fails_is_heard_of() -> None:
     trainer = Trainer(SMALL, LearningConfig(), LearnerNumerics(threads=2), 1)
     with pytest.raises(IndexError):
