@@ -95,7 +95,8 @@ def draw_map(world: World, radius_m: float, poses: list[Pose]) -> Picture:
     for i, start in enumerate(world.starts):
         pose = Pose(start.x_m, start.y_m, math.radians(start.heading_deg))
         sheet.robot(pose, radius_m)
-        sheet.label(_ahead(pose, -radius_m - 0.1), f"S{i}", (0.0, 0.0), _ROBOT)
+        beside = Pose(pose.x_m, pose.y_m, pose.heading_rad - math.pi / 2)
+        sheet.label(_ahead(beside, 0.5 * radius_m), f"S{i}", (0.0, 0.0), _ROBOT)
     if world.lap is not None:
         sheet.line(*world.lap.line, _LAP, 3)
         (x, y), (x2, y2) = world.lap.line
@@ -209,7 +210,7 @@ def _draw_route(sheet: _Sheet, route: Route) -> None:
         sheet.dot((float(x), float(y)), _ROUTE, 2)
     for place in route.places:
         sheet.dot((place.x_m, place.y_m), _ROUTE)
-        sheet.label((place.x_m, place.y_m), place.name, (0.0, 0.1), _ROUTE)
+        sheet.label((place.x_m, place.y_m), place.name, (0.0, 0.26), _ROUTE)
 
 
 def _off_walls(world: World, obstacle: Obstacle) -> tuple[float, float]:
