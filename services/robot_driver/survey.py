@@ -160,20 +160,25 @@ def _laps(planner: Planner) -> Figures:
         middle = _centre_line_lap(world)
         figures["centre_line_lap_m"] = middle
         figures["centre_line_lap_actions"] = middle / planner.motion.step_m
-    starts = _start_poses(world)
-    line = np.mean(world.lap.line, axis=0)
-    pose = starts[int(np.argmin(np.hypot(*(starts[:, :2] - line).T)))]
     for name, direction, keep in (
         ("fastest_lap_left_actions", 1, 0.005),
         ("fastest_lap_right_actions", -1, 0.005),
         ("comfortable_lap_actions", 1, COMFORTABLE_M),
     ):
-        run = planner.race(pose, _RACE_ACTIONS, direction, keep)
-        survived = int(run.survived[0])
-        angle = float(planner.winding(run.poses[: survived + 1, 0])[-1])
-        laps = direction * angle / (2.0 * math.pi)
-        figures[name] = survived / laps if laps > 0.5 else math.inf
+        starts = _start_poses(world)
+        figures[name] = min(_actions_per_lap(planner, pose, direction, keep) for pose in starts)
     return figures
+
+
+def _actions_per_lap(
+    planner: Planner, pose: npt.NDArray[np.float64], direction: int, keep_m: float
+) -> float:
+    """Mean of one long run from a start; inf if it does not get round."""
+    run = planner.race(pose, _RACE_ACTIONS, direction, keep_m)
+    survived = int(run.survived[0])
+    angle = float(planner.winding(run.poses[: survived + 1, 0])[-1])
+    laps = direction * angle / (2.0 * math.pi)
+    return survived / laps if laps > 0.5 else math.inf
 
 
 def _tour(world: World, motion: Motion) -> Figures:
