@@ -89,7 +89,9 @@ class Plan(Section):
     thesis: dict[str, float] = Field(default_factory=dict)
     """Figures of the thesis, to stand beside ours."""
     config: Tree = Field(default_factory=dict)
-    stages: Annotated[tuple[Stage, ...], Field(min_length=1, strict=False)]
+    stages: Annotated[tuple[Stage, ...], Field(strict=False)] = ()
+    tours: Annotated[int, Field(ge=0, le=100)] = 0
+    """Test drives with turns on the spot at the end, one from each of the world's first starts."""
     seeds: Annotated[tuple[int, ...], Field(min_length=1, strict=False)] = (1, 2, 3, 4, 5)
     """Fixed before any run: a comparison takes the first so many of them."""
     evaluation: Evaluation = Evaluation()
@@ -97,6 +99,8 @@ class Plan(Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        if not self.stages and not (self.tours and self.after):
+            raise ValueError("stages: expected at least one, or tours after another plan")
         ends = [stage.until for stage in self.stages]
         if ends != sorted(set(ends)):
             raise ValueError(f"stages: `until` must grow, got {ends}")
@@ -136,7 +140,7 @@ def read_plan(name: str, text: str, scale: Scale) -> Plan:
     if plan.preset:
         plan = plan.model_copy(update={"config": merged(preset_tree(plan.preset), plan.config)})
     plan = scaled(plan) if scale == "mini" else plan
-    for index in range(len(plan.stages)):
+    for index in range(max(1, len(plan.stages))):
         stage_config(plan, index, seed=1)
     return plan
 
@@ -172,7 +176,8 @@ def stage_config(plan: Plan, index: int, seed: int) -> Config:
     try:
         return Config.model_validate(tree)
     except ValidationError as error:
-        where = f"plan {plan.name}, stage {plan.stages[index].name}"
+        stage = f", stage {plan.stages[index].name}" if plan.stages else ""
+        where = f"plan {plan.name}{stage}"
         raise ConfigError(_one_line(where, error)) from error
 
 

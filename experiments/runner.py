@@ -7,6 +7,7 @@ last snapshot as if nothing had happened; what was recorded after that snapshot 
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments import probes, records, snapshot
+from experiments import probes, records, routes, snapshot
 from experiments.choosers import greedy
 from experiments.environment import CorridorEnv, with_world
 from experiments.evaluation import drive_from_first_start, evaluate
@@ -25,7 +26,9 @@ from experiments.provenance import machine
 from experiments.recorder import episode_row, memory_hash
 from experiments.references import DRIVERS, reference
 from experiments.single_process import SingleProcess, TurnDone
+from experiments.tour import drive_tour
 from experiments.traces import Figures, first_lap
+from services.robot_driver.robot import Pose
 from services.robot_driver.sim import SimRobot
 from services.robot_driver.world import load_world
 from shared.config import Config
@@ -114,6 +117,12 @@ class Run:
         self._restore(predecessor)
 
     @property
+    def _stage_name(self) -> str:
+        """Of the stage that goes on, or was the last; empty of a plan without any."""
+        stages = self.plan.stages
+        return stages[min(self._stage, len(stages) - 1)].name if stages else ""
+
+    @property
     def complete(self) -> bool:
         """Whether the last stage is over and everything written."""
         return snapshot.exists(self.folder / END)
@@ -121,6 +130,9 @@ class Run:
     def go(self, report: Callable[[Progress], None], stopped: Callable[[], bool]) -> bool:
         """Run until the plan's end or until `stopped`; returns whether it is complete."""
         if self.complete:
+            return True
+        if not self.plan.stages:
+            self._finish()
             return True
         saved_s = began_s = time.monotonic()
         turns = self._turns()
@@ -237,6 +249,8 @@ class Run:
         data = to_bytes(self._loop.trainer.target_network)
         write_atomically(self.folder / "weights.safetensors", data)
         write_atomically(self.folder / "best.safetensors", self._best)
+        if self.plan.tours:
+            self._drive_tours()
         self._refer()
         self._write_run(complete=True)
         snapshot.save(self.folder / END, self._loop, self._extra())
@@ -257,6 +271,18 @@ class Run:
             evaluated = evaluate(env, drives, starts, actions)
             rows.append(self._evaluation_row(label, "network", world, evaluated.figures))
         records.append_csv(self.folder / "evaluations.csv", records.EVALUATION_COLUMNS, rows)
+
+    def _drive_tours(self) -> None:
+        """Test drives with turns on the spot (A45): their routes, and `tours.json` about all."""
+        self._freeze()
+        env = self._looker(self._loop.config.robot.world)
+        told = []
+        for number, start in enumerate(env.robot.world.starts[: self.plan.tours]):
+            pose = Pose(start.x_m, start.y_m, math.radians(start.heading_deg))
+            tour = drive_tour(env, self._frozen, pose, number)
+            routes.write(self.folder / f"route-tour-{number}.npz", tour.route)
+            told.append(tour.told)
+        write_atomically(self.folder / "tours.json", (json.dumps(told, indent=2) + "\n").encode())
 
     def _refer(self) -> None:
         """Record floor and ceiling of all worlds that were driven in, at the end of the record."""
@@ -279,7 +305,7 @@ class Run:
         return {
             "label": label,
             "driver": driver,
-            "stage": self.plan.stages[min(self._stage, len(self.plan.stages) - 1)].name,
+            "stage": self._stage_name,
             "episode": counters.episode,
             "total_actions": counters.actions,
             "train_steps": self._loop.trainer.train_steps,
@@ -440,7 +466,7 @@ class Run:
         return Progress(
             run=f"{self.plan.name} {self.seed}",
             episode=episode,
-            episodes=self.plan.stages[-1].until,
+            episodes=self.plan.stages[-1].until if self.plan.stages else 0,
             actions=self._all_actions,
             fitness=float(np.mean(self._fitness)) if self._fitness else 0.0,
             activity=activity,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -57,6 +58,19 @@ class Tour:
         return int(self.route.trace.bumps.sum())
 
     @property
+    def told(self) -> dict[str, Any]:
+        """The figures, for a file."""
+        return {
+            "passed": self.passed,
+            "driven": self.driven,
+            "turned": self.turned,
+            "bumps": self.bumps,
+            "route_share": round(self.route_share, 4),
+            "bridges": list(self.bridges),
+            "box_dropped": self.box_dropped,
+        }
+
+    @property
     def passed(self) -> bool:
         """A full tour without a bump, past the box."""
         full = self.driven >= DRIVEN and self.route_share >= ROUTE_SHARE
@@ -100,8 +114,9 @@ def drive_tour(env: CorridorEnv, network: Predicts, pose: Pose, number: int) -> 
     log = _Log([(pose.x_m, pose.y_m, pose.heading_rad)])
     dropped = False
     draw = generator(number, ROLE)
-    left = turned_rad = 0.0
+    left, turns = 0.0, 0
     turn_rad = env.config.robot.turn_rad_s * env.config.robot.period_s
+    most_turns = round(MOST_TURNING_RAD / turn_rad)
     while sum(log.driven) < DRIVEN and len(log.bumps) < 4 * DRIVEN:
         _tell_passed(world, log)
         if not dropped and sum(log.driven) >= DROP_AFTER and _at_junction(world, env.robot.pose):
@@ -109,15 +124,15 @@ def drive_tour(env: CorridorEnv, network: Predicts, pose: Pose, number: int) -> 
             observation = env.observe()
         values = network.all_values(image_array(observation.image)[None])[0]
         action, _ = choose(values, GREEDY, draw)
-        if values[action] < 0.0 and turned_rad < MOST_TURNING_RAD:
+        if values[action] < 0.0 and turns < most_turns:
             if not left:
                 left = 1.0 if action == FORWARD_LEFT else -1.0
                 log.tell(f"turns {'left' if left > 0.0 else 'right'} on the spot")
             observation = env.turn(left > 0.0)
-            turned_rad += turn_rad
+            turns += 1
             log.add(env.robot.pose, bump=False, driven=False)
             continue
-        left = turned_rad = 0.0
+        left, turns = 0.0, 0
         _, _, bumped, _, info = env.step(np.int64(action))
         if bumped:
             _, info = env.reset()
