@@ -23,6 +23,7 @@ from experiments.measures import (
     spread,
 )
 from experiments.runs import Experiment, Floats, Run
+from experiments.traces import Trace
 
 BALANCED = 0.05
 """Shares of the three actions that differ by at most this are called balanced."""
@@ -216,6 +217,13 @@ def _expected_better(ours: str, theirs: str) -> str | None:
     if (ours, theirs) in EXPECTED_FEWER_BUMPS:
         return ours
     return theirs if (theirs, ours) in EXPECTED_FEWER_BUMPS else None
+
+
+def drive(trace: Trace, *, of_thesis: bool) -> str:
+    """How long a drive was and how often it bumped; in the thesis's test it did not (Fig 4.20)."""
+    bumps = int(trace.bumps.sum())
+    told = f"{len(trace.bumps)} actions, {bumps} bump{'' if bumps == 1 else 's'}"
+    return f"{told}, {_verdict(bumps == 0)}." if of_thesis else f"{told}."
 
 
 def policies(experiments: Sequence[Experiment]) -> list[str]:

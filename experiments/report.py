@@ -49,6 +49,7 @@ THESIS_FIGURES = {
     ("plus-minus", "worlds"): "Fig 4.15",
     ("plus-minus", "probes-last-minus"): "Fig 4.17",
     ("i16c", "probes-last-i16c"): "Fig 4.19",
+    ("i16c", "route"): "Fig 4.20",
     ("i16c-test", "route"): "Fig 4.20",
 }
 """Which of our figures stands for which of the thesis."""
@@ -285,7 +286,8 @@ def _routes(experiment: Experiment) -> list[Block]:
         for label, drive in run.routes.items():
             name = drive.trace.world
             events = "; ".join(f"{e.number} (action {e.action}) {e.text}" for e in drive.events)
-            caption = f"Drive {label} of seed {run.info.seed} in {name}."
+            caption = f"Drive {label} of seed {run.info.seed} in {name}: "
+            caption += findings.drive(drive.trace, of_thesis=theirs is not None)
             caption += f" Numbers: {events}." if events else ""
             title = f"Route in {name} ({theirs})" if theirs else f"Route in {name}"
             world = _world(name, run.folder)
