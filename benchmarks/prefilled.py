@@ -72,7 +72,8 @@ def fill(folder: Path, config: Config, images: Images | None = None) -> int:
         assert pending is not None
         memory.worlds = storage.worlds()
         memory.append(*storage.rows_of(pending[0]))
-        storage.apply_turn(*pending, memory, Maintenance(Discard(), equalised=False))
+        kept = Discard(config.memory.threshold_percent, memory.capacity)
+        storage.apply_turn(*pending, memory, Maintenance(kept, equalised=False))
         number += 1
     storage.close()
     return number

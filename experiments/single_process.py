@@ -58,10 +58,10 @@ class SingleProcess:
     def reconfigure(self, config: Config) -> None:
         """Go on with other settings of policy, memory and learning, as a new stage begins.
 
-        Call between turns. The world changes by way of the driver.
+        Call between turns. The world changes by way of the driver; capacity and threshold in force,
+        which change on the way, stay as they are.
         """
         self.config = config
-        self.memory.set_capacity(config.memory.capacity)
         self.trainer.configure(config.learning)
         self.actor.configure(config)
         if self.actor.progress is not None:

@@ -170,7 +170,11 @@ class MemoryConfig(Section):
     """Replay memory: capacity, what is discarded, what is refreshed (A27-A35)."""
 
     capacity: int = Field(default=45000, ge=30, le=5_000_000)
-    """N."""
+    """N, to begin with."""
+    capacity_max: int = Field(default=0, ge=0, le=5_000_000)
+    """N grows up to this when a search finds too few candidates; 0: never (A44, E32)."""
+    capacity_step: int = Field(default=0, ge=0, le=5_000_000)
+    """By how much it grows at a time; 0: 5000, scaled with `capacity` (A44, E17b)."""
     fill: Literal["random", "policy", "none"] = "random"
     """How the memory is filled before the first episode (A13, E9)."""
     strategy: Literal["rmm", "normm"] = "rmm"
@@ -182,7 +186,10 @@ class MemoryConfig(Section):
     recompute_below: int = Field(default=0, ge=0)
     """Fewer candidates of an over-quota action call for new marks; 0: 1000 scaled (A31, E17b)."""
     raise_at_most: int = Field(default=0, ge=0)
-    """No more candidates than this raise the threshold; 0: 2000 scaled (A32, E17b)."""
+    """No more candidates than this raise capacity or threshold; 0: 2000 scaled (A32, E17b)."""
+    mark_all_at_episode: int = Field(default=0, ge=0)
+    """At this global episode all samples stored before are marked by decree, until they are
+    discarded; 0: never (A44)."""
     equalise_every: int = Field(default=50, ge=0)
     """Episodes between reward equalisations; 0 never (A35)."""
     equalise_keep: Probability = 0.7
@@ -196,6 +203,11 @@ class MemoryConfig(Section):
             raise ValueError(
                 f"memory.threshold_percent ({self.threshold_percent}) must not exceed "
                 f"memory.threshold_max_percent ({self.threshold_max_percent})"
+            )
+        if 0 < self.capacity_max < self.capacity:
+            raise ValueError(
+                f"memory.capacity_max ({self.capacity_max}) must be 0 or at least "
+                f"memory.capacity ({self.capacity})"
             )
         return self
 

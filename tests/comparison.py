@@ -71,6 +71,7 @@ def assert_equal(one: Outcome, other: Outcome) -> None:
     """Bit for bit."""
     assert one.digests == other.digests
     assert one.threshold_percent == other.threshold_percent
+    assert one.memory.capacity == other.memory.capacity
     assert one.version == other.version
     one.memory.check_valid()
     other.memory.check_valid()

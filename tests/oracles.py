@@ -73,6 +73,7 @@ class Outcome:
     recomputed: bool = False
     last_resort: int = 0
     percent: int = 1
+    capacity: int = 0
 
 
 def scaled(count: int, capacity: int) -> int:
@@ -92,10 +93,15 @@ def discard(
     percent_max: int = 7,
     recompute_below: int = 0,
     raise_at_most: int = 0,
+    capacity_max: int = 0,
+    capacity_step: int = 0,
     bits_of: Callable[[int], int] = BITS_OF_PERCENT.__getitem__,
 ) -> Outcome:
-    """A27-A33 with E17b, E19-E22. `samples` (oldest first) loses what is removed."""
-    outcome = Outcome(percent=percent)
+    """A27-A33, A44 with E17b, E19-E22, E32. `samples` (oldest first) loses what is removed.
+
+    capacity: in force; capacity_step: never 0 where capacity_max is not.
+    """
+    outcome = Outcome(percent=percent, capacity=capacity)
     if len(samples) <= capacity:
         return outcome
     if strategy == "normm":
@@ -104,13 +110,14 @@ def discard(
     else:
         _rmm(
             samples,
-            capacity,
             outcome,
             rule,
             percent_max,
             bits_of,
             recompute_below or scaled(1000, capacity),
             raise_at_most or scaled(2000, capacity),
+            list(range(capacity + capacity_step, capacity_max, capacity_step or 1))
+            + [capacity_max] * (capacity < capacity_max),
         )
     gone = set(outcome.removed)
     samples[:] = [s for s in samples if s.id not in gone]
@@ -119,33 +126,43 @@ def discard(
 
 def _rmm(
     samples: list[Sample],
-    capacity: int,
     outcome: Outcome,
     rule: str,
     percent_max: int,
     bits_of: Callable[[int], int],
     recompute_below: int,
     raise_at_most: int,
+    larger: list[int],
 ) -> None:
-    quota = math.floor(Fraction(99, 100) * Fraction(capacity, 3))
+    """larger: the capacities that may still come, in this order."""
     of = {a: [s for s in samples if s.action == a] for a in range(3)}
-    over = [a for a in range(3) if Fraction(len(of[a])) > Fraction(capacity, 3)]
-    excess = {a: len(of[a]) - quota for a in over}
+
+    def excess() -> dict[int, int]:
+        if len(samples) <= outcome.capacity:
+            return {}
+        third = Fraction(outcome.capacity, 3)
+        quota = math.floor(Fraction(99, 100) * third)
+        return {a: len(of[a]) - quota for a in range(3) if Fraction(len(of[a])) > third}
 
     def found(action: int) -> int:
         return sum(s.candidate for s in of[action])
 
     # E20, and E21: a search comes before the last resort.
-    if any(found(a) < recompute_below or found(a) < excess[a] for a in over):
+    if any(found(a) < recompute_below or found(a) < n for a, n in excess().items()):
         outcome.recomputed = True
         for a in range(3):
             similar = marks([s.descriptor for s in of[a]], bits_of(outcome.percent), rule)
             for s, like_newer in zip(of[a], similar, strict=True):
                 s.candidate = like_newer or s.forced
-        if any(found(a) <= raise_at_most for a in over):
-            outcome.percent = min(outcome.percent + 1, percent_max)
-    for a in over:
+        if any(found(a) <= raise_at_most for a in excess()):
+            if larger:
+                outcome.capacity = larger.pop(0)
+            else:
+                outcome.percent = min(outcome.percent + 1, percent_max)
+        while larger and any(found(a) < n for a, n in excess().items()):
+            outcome.capacity = larger.pop(0)
+    for a, n in excess().items():
         queue = [s for s in of[a] if s.candidate] + [s for s in of[a] if not s.candidate]
-        outcome.removed += [s.id for s in queue[: excess[a]]]
-        outcome.last_resort += sum(not s.candidate for s in queue[: excess[a]])
+        outcome.removed += [s.id for s in queue[:n]]
+        outcome.last_resort += sum(not s.candidate for s in queue[:n])
     outcome.removed.sort()

@@ -148,7 +148,7 @@ class Intake:
             turn=view.position.turn,
             turn_change=view.position.turn_change,
             size=sum(view.by_action),
-            capacity=memory.capacity,
+            capacity=view.position.capacity,
             filling=filling(counters, memory),
             by_action=view.by_action,
             candidates_by_action=view.candidates,

@@ -124,7 +124,7 @@ class Storage(Feed):
                 column = _column(memory, REWARDS)
                 self._put_change(txn, number, "rewards", column)
                 txn.put(b"rewards", column, db=self._db["columns"])
-            if done.discarded.recomputed:
+            if done.discarded.recomputed or done.decreed:
                 txn.put(b"marks", _column(memory, MARKS), db=self._db["columns"])
             turn, turn_change = position.turn, position.turn_change
             if commit.episode:
@@ -137,10 +137,15 @@ class Storage(Feed):
                 }
                 txn.put(key_of(turn), pack(entry), db=self._db["turns"])
             position = Position(
-                number, commit.commit, turn, turn_change, done.discarded.threshold_percent
+                number,
+                commit.commit,
+                turn,
+                turn_change,
+                done.discarded.threshold_percent,
+                done.discarded.capacity,
             )
             self._put_meta(txn, "position", asdict(position))
-            self._forget_changes(txn, number)
+            self._forget_changes(txn, position)
         return position
 
     def turns(self, since: int, limit: int) -> tuple[Turn, ...]:
@@ -156,8 +161,8 @@ class Storage(Feed):
 
     def load(self) -> ReplayMemory:
         """The memory as of the newest applied turn."""
-        memory = ReplayMemory(self._config.capacity)
         with self._env.begin() as txn:
+            memory = ReplayMemory(Position(**self._meta(txn, "position")).capacity)
             memory.worlds = list(self._meta(txn, "worlds"))
             ids = self._alive(txn)
             for start in range(0, len(ids), PART_ROWS):
@@ -173,12 +178,12 @@ class Storage(Feed):
     def _put_change(self, txn: Txn, number: int, kind: str, what: Any) -> None:
         txn.put(key_of(number), pack([kind, what]), db=self._db["changes"])
 
-    def _forget_changes(self, txn: Txn, newest: int) -> None:
+    def _forget_changes(self, txn: Txn, position: Position) -> None:
         """Delete old changes, and with a forgotten discard the samples it removed."""
-        most_dead = max(self._config.capacity // 2, 1000)
+        most_dead = max(position.capacity // 2, 1000)
         with txn.cursor(self._db["changes"]) as cursor:
             while cursor.first() and (
-                number_of(cursor.key()) <= newest - CHANGES_KEPT
+                number_of(cursor.key()) <= position.change - CHANGES_KEPT
                 or txn.stat(self._db["dead"])["entries"] > most_dead
             ):
                 kind, what = unpack(cursor.value())

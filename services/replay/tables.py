@@ -2,7 +2,7 @@
 
 Images are written once and never changed; what changes lies beside them. Tables:
 
-meta      counters, change number, processed commit, threshold, identity of the run
+meta      counters, change number, processed commit, threshold, capacity, identity of the run
 commits   commit number -> record of the submission (provenance, metrics)
 identity  robot, life, number -> commit number: the deduplication
 images    insertion number -> 3750 bytes
@@ -34,7 +34,7 @@ from shared.errors import StateError
 from shared.messages import IMAGE_SHAPE
 from shared.rl.memory import SAMPLE
 
-SCHEMA = 1
+SCHEMA = 2
 MAP_BYTES = 1 << 38
 """Largest size of the file; only what is used exists."""
 REWARDS = np.dtype([("id", "<u8"), ("reward", "<f4")])
@@ -80,6 +80,8 @@ class Position:
     """Newest counted episode whose turn is applied."""
     turn_change: int
     threshold_percent: int
+    capacity: int
+    """N in force: it may have grown (A44)."""
 
 
 class Tables:
@@ -97,7 +99,7 @@ class Tables:
             if known is None:
                 self._put_meta(txn, "identity", [SCHEMA, identity])
                 self._put_meta(txn, "counters", Counters().to_dict())
-                start = Position(0, 0, 0, 0, config.threshold_percent)
+                start = Position(0, 0, 0, 0, config.threshold_percent, config.capacity)
                 self._put_meta(txn, "position", asdict(start))
                 self._put_meta(txn, "worlds", [])
             elif list(known) != [SCHEMA, identity]:

@@ -30,8 +30,8 @@ from shared.weights import WeightsFetcher
 Activity = Literal["idle", "committing", "descriptors", "equalising", "discarding", "waiting"]
 COLUMNS = (
     "episode robot ended bump fitness fitness_mean_100 actions total_actions bumps laps_left "
-    "laps_right longest_run_actions samples memory discarded last_resort recomputed equalised "
-    "threshold_percent weights_version"
+    "laps_right longest_run_actions samples memory capacity discarded last_resort recomputed "
+    "equalised threshold_percent weights_version"
 )
 
 
@@ -133,6 +133,10 @@ class TurnWorker(threading.Thread):
                 commit.episode,
                 done.discarded.last_resort,
             )
+        if done.decreed:
+            self._me.log.info(
+                "episode %d: %d samples marked by decree", commit.episode, done.decreed
+            )
         self._show(memory, position=position, activity="idle")
 
     def _await_weights(self, least: int) -> None:
@@ -168,6 +172,7 @@ class TurnWorker(threading.Thread):
     ) -> dict[str, int | float | str]:
         extra = {
             "memory": len(memory),
+            "capacity": done.discarded.capacity,
             "discarded": len(done.discarded.ids),
             "last_resort": done.discarded.last_resort,
             "recomputed": int(done.discarded.recomputed),

@@ -1,4 +1,4 @@
-"""Which samples go when the memory is full: NoRMM and RMM (section 3.5, A27-A34)."""
+"""Which samples go when the memory is full, and when it grows instead (A27-A34, A44)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from shared.config import MemoryConfig
 
 THESIS_CAPACITY = 45_000
-RECOMPUTE_BELOW, RAISE_AT_MOST = 1000, 2000
+RECOMPUTE_BELOW, RAISE_AT_MOST, CAPACITY_STEP = 1000, 2000, 5000
 Describe = Callable[[Images], npt.NDArray[np.uint8]]
 """Descriptors uint8 [n, 15] of images under the current target network."""
 
@@ -44,13 +44,15 @@ def rmm_share(capacity: int) -> int:
 class Discard:
     """What one discard did."""
 
+    threshold_percent: int
+    """Threshold for the next recomputation (E19)."""
+    capacity: int
+    """N from now on (E32); the memory has it already."""
     ids: Ids = field(default_factory=lambda: np.zeros(0, np.uint64))
     """Removed insertion numbers, ascending."""
     recomputed: bool = False
     last_resort: int = 0
     """Samples removed by age because candidates ran out (E21)."""
-    threshold_percent: int = 1
-    """Threshold for the next recomputation (E19)."""
 
 
 def discard_oldest(memory: ReplayMemory) -> Ids:
@@ -87,52 +89,76 @@ def discard(
     """Reduce a memory that holds more than N samples (A12, A27); do nothing otherwise.
 
     RMM (A31-A33, E19-E22): only actions above N / 3 lose samples, oldest candidates first, down to
-    99 % of N / 3. When one of them has too few candidates, all marks are computed anew, once; if
-    one still has no more than `raise_at_most`, the threshold grows by 1 % for the next time. Too
+    99 % of N / 3. When one of them has too few candidates, all marks are computed anew, once. Too
     few means fewer than `recompute_below`, or than must go now: with N >= 45,000 the former is
-    always the larger number. What candidates cannot cover goes by age (E21), so that
-    len(D) <= N holds afterwards. Marks, descriptors and rows of `memory` are changed.
+    always the larger number. If one still has no more than `raise_at_most`, the capacity grows
+    (A44, E32), at once; if it cannot, the threshold grows by 1 % for the next time. What candidates
+    cannot cover goes by age (E21), so that len(D) <= N holds afterwards. Marks, descriptors, rows
+    and capacity of `memory` are changed.
     """
     if len(memory) <= memory.capacity:
-        return Discard(threshold_percent=threshold_percent)
+        return Discard(threshold_percent, memory.capacity)
     if config.strategy == "normm":
         ids = discard_oldest(memory)
         memory.remove(ids)
-        return Discard(ids, threshold_percent=threshold_percent)
+        return Discard(threshold_percent, memory.capacity, ids)
 
-    share = rmm_share(memory.capacity)
-    surplus = {
-        action: count - share
-        for action, count in enumerate(memory.by_action())
-        if ACTIONS * count > memory.capacity
-    }
-    recomputed = _too_few_candidates(memory, config, surplus)
+    recomputed = _too_few_candidates(memory, config)
     if recomputed:
         bits = threshold_bits(threshold_percent)
         recompute_marks(memory, config, bits, describe, version)
-        threshold_percent = _next_threshold(memory, config, surplus, threshold_percent)
-    removed, last_resort = _oldest_candidates(memory, surplus)
+        failed = _search_failed(memory, config)
+        grown = _grown_capacity(memory, config, failed)
+        if failed and grown == memory.capacity:
+            threshold_percent = min(threshold_percent + 1, config.threshold_max_percent)
+        memory.set_capacity(grown)
+    removed, last_resort = _oldest_candidates(memory, _surplus(memory, memory.capacity))
     memory.remove(removed)
-    return Discard(removed, recomputed, last_resort, threshold_percent)
+    return Discard(threshold_percent, memory.capacity, removed, recomputed, last_resort)
 
 
-def _too_few_candidates(
-    memory: ReplayMemory, config: MemoryConfig, surplus: dict[int, int]
-) -> bool:
+def _surplus(memory: ReplayMemory, capacity: int) -> dict[int, int]:
+    """Actions that must discard with this capacity, and how many samples each (A33)."""
+    if len(memory) <= capacity:
+        return {}
+    return {
+        action: count - rmm_share(capacity)
+        for action, count in enumerate(memory.by_action())
+        if ACTIONS * count > capacity
+    }
+
+
+def _too_few_candidates(memory: ReplayMemory, config: MemoryConfig) -> bool:
+    """Whether marks must be computed anew (A31, E20)."""
     least = config.recompute_below or scaled_count(RECOMPUTE_BELOW, memory.capacity)
-    candidates = memory.candidates_by_action()
-    return any(candidates[action] < max(least, count) for action, count in surplus.items())
+    return _fewer(memory, memory.capacity, least)
 
 
-def _next_threshold(
-    memory: ReplayMemory, config: MemoryConfig, surplus: dict[int, int], percent: int
-) -> int:
-    """One percent more when some action that must discard has too few candidates (A32, E19)."""
+def _search_failed(memory: ReplayMemory, config: MemoryConfig) -> bool:
+    """Whether some action that must discard still has too few candidates (A32, E19)."""
     most = config.raise_at_most or scaled_count(RAISE_AT_MOST, memory.capacity)
     candidates = memory.candidates_by_action()
-    if any(candidates[action] <= most for action in surplus):
-        return min(percent + 1, config.threshold_max_percent)
-    return percent
+    return any(candidates[action] <= most for action in _surplus(memory, memory.capacity))
+
+
+def _grown_capacity(memory: ReplayMemory, config: MemoryConfig, failed: bool) -> int:
+    """N after a search: one step more if it failed, up to `capacity_max` (A44, E32).
+
+    Further steps follow while candidates could not cover what must go: nothing goes by age from a
+    memory that may still grow. In memories of the thesis's size one step always suffices.
+    """
+    step = config.capacity_step or scaled_count(CAPACITY_STEP, config.capacity)
+    capacity = memory.capacity
+    while capacity < config.capacity_max and (failed or _fewer(memory, capacity)):
+        capacity, failed = min(capacity + step, config.capacity_max), False
+    return capacity
+
+
+def _fewer(memory: ReplayMemory, capacity: int, least: int = 0) -> bool:
+    """Whether an action has fewer candidates than `least`, or than must go with this capacity."""
+    candidates = memory.candidates_by_action()
+    surplus = _surplus(memory, capacity)
+    return any(candidates[action] < max(least, count) for action, count in surplus.items())
 
 
 def _oldest_candidates(memory: ReplayMemory, surplus: dict[int, int]) -> tuple[Ids, int]:
@@ -142,7 +168,7 @@ def _oldest_candidates(memory: ReplayMemory, surplus: dict[int, int]) -> tuple[I
     """
     # Each look at one field of the rows runs through all their bytes: look at each once.
     ids, actions, marked = (memory.rows[name].copy() for name in ("id", "action", "candidate"))
-    chosen, last_resort = [], 0
+    chosen, last_resort = [ids[:0]], 0
     for action, count in surplus.items():
         own = actions == action
         candidates = ids[own & marked][:count]

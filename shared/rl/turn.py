@@ -1,12 +1,13 @@
 """One turn in the order of E25, as far as it concerns the memory.
 
-append -> discard (candidates as needed) -> equalise -> (the learner:) train or fit -> target rule
--> checkpoint -> publish. The replay service and the single-process loop both call these.
+append -> marks by decree -> discard (candidates as needed) -> equalise -> (the learner:) train or
+fit -> target rule -> checkpoint -> publish. The replay service and the single-process loop both
+call these.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy.typing as npt
 
 from shared.rl.engine import Progress
 from shared.rl.equalisation import due, equalised
-from shared.rl.memory import SAMPLE, Ids, Images, ReplayMemory
+from shared.rl.memory import SAMPLE, Images, ReplayMemory
 from shared.rl.predictor import Predictor
 from shared.rl.retention import Discard, discard
 
@@ -29,7 +30,8 @@ class Maintenance:
 
     discarded: Discard
     equalised: bool
-    ids: Ids = field(default_factory=lambda: np.zeros(0, np.uint64))
+    decreed: int = 0
+    """Samples that were marked by decree (A44)."""
 
 
 def sample_rows(
@@ -66,18 +68,31 @@ def maintain(
     describing: Progress | None = None,
     equalising: Progress | None = None,
 ) -> Maintenance:
-    """Discard and, when due at episode `number`, equalise. `memory` is changed in place."""
+    """Discard and, when due at episode `number`, mark by decree before and equalise after.
+
+    `memory` is changed in place.
+    """
 
     def describe(images: Images) -> npt.NDArray[np.uint8]:
         described = int(np.sum(memory.rows["described_by"] == predictor.version))
         return predictor.descriptors(images, _beyond(described, len(memory), describing))
 
+    decreed = _mark_by_decree(memory, number, config)
     dropped = discard(memory, config, threshold_percent, describe, predictor.version)
     refresh = due(number, config.equalise_every) and len(memory) > 0
     if refresh:
         values = _current_values(memory, predictor, equalising)
         memory.rows["reward"] = equalised(memory.rows["reward"], values, config)
-    return Maintenance(dropped, refresh)
+    return Maintenance(dropped, refresh, decreed)
+
+
+def _mark_by_decree(memory: ReplayMemory, number: int, config: MemoryConfig) -> int:
+    """At `mark_all_at_episode`, mark all samples stored before that episode; how many (A44)."""
+    if number == 0 or number != config.mark_all_at_episode:
+        return 0
+    older = memory.ids[memory.rows["episode"] < number]
+    memory.force_candidates(older)
+    return len(older)
 
 
 def _current_values(

@@ -75,12 +75,17 @@ class Bench:
             percent_max=self.config.threshold_max_percent,
             recompute_below=self.config.recompute_below,
             raise_at_most=self.config.raise_at_most,
+            capacity_max=self.config.capacity_max,
+            capacity_step=self.config.capacity_step or oracles.scaled(5000, self.config.capacity),
         )
+        capacity, percent = self.memory.capacity, self.percent
+        decreed = {s.id for s in self.samples if s.forced}
         found = discard(self.memory, self.config, self.percent, self.describe, self.version)
         assert [int(i) for i in found.ids] == expected.removed
         assert found.recomputed == expected.recomputed
         assert found.last_resort == expected.last_resort
         assert found.threshold_percent == expected.percent
+        assert found.capacity == self.memory.capacity == expected.capacity
         assert [int(i) for i in self.memory.ids] == [s.id for s in self.samples]
         assert [bool(c) for c in self.memory.rows["candidate"]] == [
             s.candidate for s in self.samples
@@ -88,13 +93,32 @@ class Bench:
         assert [bool(f) for f in self.memory.rows["forced"]] == [s.forced for s in self.samples]
         self.memory.check_valid()
         self._check_quotas(before)
+        self._check_growth(found, capacity, percent, decreed)
         self.percent = found.threshold_percent
         return found
+
+    def _check_growth(self, found: Discard, capacity: int, percent: int, decreed: set[int]) -> None:
+        """What holds whatever the rules of a single discard are (A44, E32)."""
+        most = max(capacity, self.config.capacity_max)
+        assert capacity <= found.capacity <= most
+        if found.capacity > capacity:
+            assert found.recomputed
+        if found.threshold_percent > percent or (
+            found.last_resort and self.config.strategy == "rmm"
+        ):
+            assert found.capacity == most
+        if found.threshold_percent > percent:
+            assert (found.capacity, found.threshold_percent) == (capacity, percent + 1)
+        kept = self.memory.rows[["id", "candidate", "forced"]].tolist()
+        assert {i for i, candidate, forced in kept if candidate and forced} == decreed - {
+            int(i) for i in found.ids
+        }
 
     def _check_quotas(self, before: int) -> None:
         capacity = self.memory.capacity
         assert len(self.memory) <= capacity
-        if before <= capacity:
+        if before <= capacity:  # also when it has just grown
+            assert len(self.memory) == before
             return
         if self.config.strategy == "normm":
             assert len(self.memory) == 99 * capacity // 100
@@ -148,6 +172,7 @@ additions = st.lists(
     rule=st.sampled_from(["paper", "cover"]),
     below=st.sampled_from([0, 1, 4]),
     most=st.sampled_from([0, 1, 6]),
+    growth=st.sampled_from([(0, 0), (0, 0), (60, 0), (60, 5), (60, 40)]),
     data=st.data(),
 )
 def test_repeated_discards_equal_the_rules(
@@ -157,13 +182,24 @@ def test_repeated_discards_equal_the_rules(
     rule: Literal["paper", "cover"],
     below: int,
     most: int,
+    growth: tuple[int, int],
     data: st.DataObject,
 ) -> None:
-    bench = Bench(capacity, strategy=strategy, rule=rule, recompute_below=below, raise_at_most=most)
+    bench = Bench(
+        capacity,
+        strategy=strategy,
+        rule=rule,
+        recompute_below=below,
+        raise_at_most=most,
+        capacity_max=growth[0],
+        capacity_step=growth[1],
+    )
     for kinds in rounds:
         bench.add(*kinds)
         if bench.samples and data.draw(st.integers(0, 3)) == 0:
             bench.force(data.draw(st.sampled_from([s.id for s in bench.samples])))
+        elif data.draw(st.integers(0, 9)) == 0:
+            bench.force(*[s.id for s in bench.samples])
         if data.draw(st.integers(0, 4)) == 0:
             bench.memory.set_capacity(data.draw(st.integers(3, 60)))
         bench.version += data.draw(st.integers(0, 1))
@@ -399,3 +435,100 @@ def test_rmm_result_is_balanced_when_all_actions_are_above_quota() -> None:
     bench.add(*[(i % 3, i % 2) for i in range(60)])
     bench.discard()
     assert bench.memory.by_action() == [9, 9, 9]
+
+
+# ------------------------------------------------------------------------- growth
+
+
+def unlike(first: int, count: int) -> list[tuple[int, int]]:
+    """Samples of action 0 with descriptors that differ from each other in many bits."""
+    draw = np.random.default_rng(first)
+    return [(0, int.from_bytes(draw.bytes(15), "big")) for _ in range(count)]
+
+
+def test_a_failed_search_makes_the_memory_grow_at_once_and_nothing_goes() -> None:
+    bench = Bench(90, capacity_max=110, capacity_step=10)
+    bench.add(*unlike(1, 91))
+    found = bench.discard()
+    assert (found.capacity, found.threshold_percent, len(found.ids)) == (100, 1, 0)
+    assert found.recomputed
+    bench.add(*unlike(2, 9))
+    assert not bench.discard().recomputed  # holds exactly N
+    bench.add(*unlike(3, 1))
+    assert (bench.discard().capacity, len(bench.memory)) == (110, 101)
+
+
+def test_the_threshold_rises_only_when_the_memory_may_not_grow_any_more() -> None:
+    bench = Bench(90, capacity_max=105, capacity_step=10, threshold_max_percent=3)
+    steps = []
+    for i in range(5):
+        bench.add(*unlike(i, bench.memory.capacity + 1 - len(bench.memory)))
+        found = bench.discard()
+        steps.append((found.capacity, found.threshold_percent, found.last_resort > 0))
+    assert steps == [
+        (100, 1, False), (105, 1, False), (105, 2, True), (105, 3, True), (105, 3, True),
+    ]  # fmt: skip
+
+
+def test_a_search_that_finds_enough_leaves_the_capacity_alone() -> None:
+    bench = Bench(90, capacity_max=200, capacity_step=10)
+    bench.add(*[(0, 0)] * 91)
+    found = bench.discard()
+    assert (found.recomputed, found.capacity, len(bench.memory)) == (True, 90, 29)
+
+
+def test_a_memory_grows_by_further_steps_rather_than_discarding_by_age() -> None:
+    bench = Bench(90, capacity_max=200, capacity_step=10)
+    bench.add(*unlike(1, 115))
+    found = bench.discard()
+    assert (found.capacity, len(found.ids), found.last_resort) == (120, 0, 0)
+
+
+def test_candidates_that_cannot_cover_what_must_go_make_the_memory_grow_too() -> None:
+    """More than `raise_at_most`, but fewer than the surplus: only small memories know this."""
+    bench = Bench(90, capacity_max=200, capacity_step=10, raise_at_most=5)
+    bench.add(*unlike(1, 71), *[(0, 0)] * 20)
+    found = bench.discard()
+    assert (found.capacity, found.threshold_percent, found.last_resort) == (100, 1, 0)
+
+
+def test_normm_never_grows() -> None:
+    bench = Bench(90, strategy="normm", capacity_max=200, capacity_step=10)
+    bench.add(*unlike(1, 91))
+    assert (bench.discard().capacity, len(bench.memory)) == (90, 89)
+
+
+@pytest.mark.parametrize(("configured", "step"), [(45_000, 5000), (50_000, 5000), (90, 10)])
+def test_the_step_scales_with_the_configured_capacity(configured: int, step: int) -> None:
+    config = MemoryConfig(capacity=configured, capacity_max=90_000)
+    for in_force in (30, 60):  # what it is now does not matter
+        bench = Bench(in_force)
+        bench.config = config.model_copy(update={"raise_at_most": 1, "recompute_below": 1})
+        bench.add(*unlike(1, in_force + 1))
+        assert bench.discard().capacity == in_force + step
+
+
+def test_a_capacity_above_the_largest_one_does_not_grow_and_is_not_cut() -> None:
+    bench = Bench(90, capacity_max=100)
+    bench.memory.set_capacity(150)
+    bench.add(*unlike(1, 151))
+    assert (bench.discard().capacity, bench.percent) == (150, 2)
+
+
+def test_samples_marked_by_decree_go_before_the_memory_grows() -> None:
+    bench = Bench(90, capacity_max=100, capacity_step=10, raise_at_most=30, recompute_below=20)
+    bench.add(*unlike(1, 90))
+    bench.force(*range(1, 91))
+    bench.add(*unlike(2, 1))
+    found = bench.discard()
+    assert (list(found.ids), found.recomputed) == (list(range(1, 63)), False)
+    bench.add(*unlike(3, 62))
+    found = bench.discard()  # 28 marks are left where 62 must go
+    assert (found.recomputed, found.capacity, found.last_resort) == (True, 100, 0)
+    assert bench.memory.rows["forced"].sum() == 28
+
+
+@pytest.mark.parametrize("capacity_max", [1, 89])
+def test_a_largest_capacity_below_the_first_is_refused(capacity_max: int) -> None:
+    with pytest.raises(ValueError, match=r"memory\.capacity_max .* at least memory\.capacity"):
+        MemoryConfig(capacity=90, capacity_max=capacity_max)
