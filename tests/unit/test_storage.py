@@ -47,6 +47,7 @@ class Bench:
         self.version = 1
         self.model: list[dict[str, Any]] = []
         self.percent = self.config.threshold_percent
+        self.capacity = self.config.capacity
         self.change = 0
         self.next_id = 1
         self.filled = 0
@@ -90,6 +91,7 @@ class Bench:
         position = self.storage.apply_turn(commit, record, self.memory, done)
         self._model_turn(rows, images, commit.episode)
         assert (position.change, position.threshold_percent) == (self.change, self.percent)
+        assert position.capacity == self.capacity
         assert position.processed == commit.commit
         return True
 
@@ -97,24 +99,31 @@ class Bench:
         for row, image in zip(rows, images, strict=True):
             sample = {"id": int(row["id"]), "action": int(row["action"]), "forced": False}
             sample |= {"reward": float(row["reward"]), "image": image.tobytes()}
+            sample["episode"] = episode
             self.model.append({**sample, "candidate": False})
         self._note(len(rows))
+        if episode and episode == self.config.mark_all_at_episode:
+            for s in self.model:
+                if s["episode"] != episode:
+                    s["forced"] = s["candidate"] = True
         samples = [
             oracles.Sample(s["id"], s["action"], s["image"][:15], s["candidate"], s["forced"])
             for s in self.model
         ]
         outcome = oracles.discard(
             samples,
-            self.config.capacity,
+            self.capacity,
             self.percent,
             strategy=self.config.strategy,
             rule=self.config.rule,
+            capacity_max=self.config.capacity_max,
+            capacity_step=self.config.capacity_step or oracles.scaled(5000, self.config.capacity),
         )
         kept = {s.id: s for s in samples}
         self.model = [s for s in self.model if s["id"] in kept]
         for s in self.model:
             s["candidate"] = kept[s["id"]].candidate
-        self.percent = outcome.percent
+        self.percent, self.capacity = outcome.percent, outcome.capacity
         self._note(len(outcome.removed))
         every = self.config.equalise_every
         if self.model and episode and every and episode % every == 0:
@@ -135,12 +144,13 @@ class Bench:
         loaded = self.storage.load()
         loaded.check_valid()
         assert self.storage.size() == len(loaded)
+        assert loaded.capacity == self.memory.capacity == self.capacity
         for name in loaded.rows.dtype.names or ():
             if name != "slot":
                 assert loaded.rows[name].tobytes() == self.memory.rows[name].tobytes(), name
         every = np.arange(len(loaded))
         assert loaded.images(every).tobytes() == self.memory.images(every).tobytes()
-        for name in ("id", "action", "candidate"):
+        for name in ("id", "action", "candidate", "forced"):
             assert loaded.rows[name].tolist() == [s[name] for s in self.model]
         same_samples(loaded, self.seen[self.change])
         for s, reward in zip(self.model, loaded.rows["reward"].tolist(), strict=True):
@@ -200,11 +210,25 @@ events = st.lists(
     strategy=st.sampled_from(["rmm", "rmm", "normm"]),
     rule=st.sampled_from(["paper", "cover"]),
     fill=st.sampled_from(["random", "none"]),
+    growth=st.sampled_from([(0, 0), (60, 0), (60, 20)]),
+    decree=st.sampled_from([0, 2, 4]),
 )
 def test_disk_memory_and_mirror_hold_what_the_rules_say_over_restarts(
-    given_events: list[tuple[str, int]], strategy: str, rule: str, fill: str
+    given_events: list[tuple[str, int]],
+    strategy: str,
+    rule: str,
+    fill: str,
+    growth: tuple[int, int],
+    decree: int,
 ) -> None:
-    with bench(strategy=strategy, rule=rule, fill=fill) as b:
+    with bench(
+        strategy=strategy,
+        rule=rule,
+        fill=fill,
+        capacity_max=growth[0],
+        capacity_step=growth[1],
+        mark_all_at_episode=decree,
+    ) as b:
         mirror, at = SampleStore(), 0
         for number, (event, n) in enumerate(given_events):
             if event == "reopen":
@@ -317,6 +341,43 @@ def test_a_turn_that_was_begun_but_not_applied_leaves_nothing_behind() -> None:
         b.reopen()  # killed here
         assert b.turn()
         b.check()
+
+
+def test_marks_by_decree_are_on_disk_at_once_and_set_only_once() -> None:
+    """A44: they do not wait for the next recomputation, and stay until the samples go."""
+    with bench(mark_all_at_episode=2) as b:
+        marked = []
+        for seed in range(4):
+            b.commit(make_episode(5, seed=seed, images=some_images(5, seed)))
+            b.turn()
+            b.check()
+            b.reopen()
+            marked.append(b.memory.ids[b.memory.rows["forced"]].tolist())
+        assert marked == [[], *[[1, 2, 3, 4, 5]] * 3]
+        assert b.memory.rows["candidate"].tolist() == b.memory.rows["forced"].tolist()
+
+
+def test_samples_that_filled_the_memory_are_marked_by_decree_too() -> None:
+    with bench(fill="random", mark_all_at_episode=1) as b:
+        b.commit(make_episode(30, seed=1, fill=True))
+        b.turn()
+        assert not b.memory.rows["forced"].any()
+        b.commit(make_episode(9, seed=2))
+        b.turn()
+        b.check()
+        assert b.memory.ids[-9:].tolist() == list(range(31, 40))
+        assert b.memory.rows["forced"].tolist() == (b.memory.ids <= 30).tolist()
+
+
+def test_a_grown_capacity_survives_a_restart() -> None:
+    with bench(capacity_max=60, capacity_step=10) as b:
+        noise = np.random.default_rng(1).integers(0, 256, (31, 50, 75)).astype(np.uint8)
+        b.commit(make_episode(31, seed=1, images=noise))
+        b.turn()
+        assert (b.memory.capacity, len(b.memory)) == (40, 31)
+        b.reopen()
+        b.check()
+        assert b.memory.capacity == b.storage.position().capacity == 40
 
 
 def test_rows_carry_their_provenance_to_disk_and_back() -> None:
