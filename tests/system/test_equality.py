@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import random
 import secrets
 from pathlib import Path
@@ -18,8 +19,19 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]
 
 @pytest.fixture(scope="module")
 def config() -> Config:
-    """Discard, equalisation, fitting phases and target copies all happen within 62 episodes."""
-    return make_config("equality", run={"episodes": EPISODES})
+    """Everything that changes memory or weights happens within 62 episodes.
+
+    Discards, growth and then a higher threshold, marks by decree, equalisation, fitting phases and
+    target copies.
+    """
+    memory = {
+        "capacity_max": 430,
+        "capacity_step": 20,
+        "recompute_below": 60,
+        "raise_at_most": 100,
+        "mark_all_at_episode": 45,
+    }
+    return make_config("equality", run={"episodes": EPISODES}, memory=memory)
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +39,10 @@ def reference(config: Config) -> Outcome:
     """The single-process loop with the same seed, checked to contain what is to be compared."""
     outcome = single_process(config, EPISODES)
     assert outcome.digests[-1][0] == EPISODES
-    assert outcome.memory.rows["candidate"].any()
+    assert (outcome.memory.rows["candidate"] & ~outcome.memory.rows["forced"]).any()
+    assert outcome.memory.rows["forced"].any()
+    assert outcome.memory.capacity == config.memory.capacity_max > config.memory.capacity
+    assert outcome.threshold_percent > config.memory.threshold_percent
     assert outcome.version > 10
     return outcome
 
@@ -38,8 +53,14 @@ def test_undisturbed_run_equals_the_single_process_loop(
     with Cluster(config, tmp_path / "run") as cluster:
         cluster.start(*ALL)
         cluster.wait_episodes(EPISODES, 200)
+        state = cluster.replay()
         cluster.stop_all()
     assert_equal(reference, distributed(config, tmp_path / "run"))
+    assert state is not None
+    with (tmp_path / "run" / "metrics" / "episodes.csv").open(newline="") as file:
+        capacities = [int(row["capacity"]) for row in csv.DictReader(file)]
+    assert state.capacity == capacities[-1] == reference.memory.capacity
+    assert set(capacities) == {400, 420, 430}
 
 
 def test_replay_learner_and_router_killed_at_random_moments_still_end_equal(
