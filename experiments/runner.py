@@ -251,6 +251,7 @@ class Run:
         write_atomically(self.folder / "best.safetensors", self._best)
         if self.plan.tours:
             self._drive_tours()
+        self._look_with_best()
         self._refer()
         self._write_run(complete=True)
         snapshot.save(self.folder / END, self._loop, self._extra())
@@ -271,6 +272,13 @@ class Run:
             evaluated = evaluate(env, drives, starts, actions)
             rows.append(self._evaluation_row(label, "network", world, evaluated.figures))
         records.append_csv(self.folder / "evaluations.csv", records.EVALUATION_COLUMNS, rows)
+
+    def _look_with_best(self) -> None:
+        """What the weights of the longest bump-free run predict (Fig 4.7)."""
+        self._frozen.load(0, self._best)
+        for world in sorted({self._loop.config.robot.world, *self.plan.evaluation.worlds}):
+            found = probes.look(self._looker(world).robot, self._frozen)
+            probes.save(self.folder / f"probes-best-{world}.npz", found)
 
     def _drive_tours(self) -> None:
         """Test drives with turns on the spot (A45): their routes, and `tours.json` about all."""

@@ -158,6 +158,13 @@ def test_every_stage_is_evaluated_and_so_are_floor_and_ceiling(finished: Path) -
     assert floor == {(d, w) for d in ("random", "planner") for w in ("minus", "plus")}
 
 
+def test_pictures_are_looked_at_as_every_stage_ends_and_with_the_best_weights(
+    finished: Path,
+) -> None:
+    found = {path.name for path in (finished / "two").glob("probes-*.npz")}
+    assert found == {"probes-a-minus.npz", "probes-b-plus.npz", "probes-best-plus.npz"}
+
+
 def test_a_run_without_its_predecessor_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StateError, match="one, which has not been run to its end"):
         run(SECOND, tmp_path / "two", tmp_path / "one")
