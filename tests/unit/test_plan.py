@@ -152,3 +152,17 @@ def test_a_wrong_plan_is_refused_in_one_line(change: tuple[str, str], complaint:
 def test_an_unknown_plan_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ConfigError, match="plus-rmm"):
         load_plan("plus-rnm", "mini")
+
+
+def test_i16c_lets_the_memory_grow_and_marks_what_was_there_before() -> None:
+    """A44."""
+    plan = load_plan("i16c", "full")
+    memory = stage_config(plan, 0, 1).memory
+    assert (memory.capacity, memory.capacity_max, memory.capacity_step) == (50000, 90000, 5000)
+    assert (memory.threshold_percent, memory.threshold_max_percent) == (5, 7)
+    assert plan.stages[0].force_candidates
+    assert (plan.after, plan.stages[0].until) == ("plus-minus", 3000)
+    kinds = [change["kind"] for change in plan.stages[0].changes]
+    assert {"place", "remove"} <= set(kinds)
+    mini = stage_config(load_plan("i16c", "mini"), 0, 1).memory
+    assert (mini.capacity, mini.capacity_max, mini.capacity_step) == (2500, 4500, 250)
