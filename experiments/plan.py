@@ -122,19 +122,13 @@ def load_plan(name: str, scale: Scale) -> Plan:
     Raises:
         ConfigError: There is none of that name, or its file is wrong.
     """
-    if name not in plan_names():
-        known = ", ".join(plan_names())
-        raise ConfigError(f"experiment: expected one of {known}, got {name!r}")
-    text = resources.files("experiments").joinpath("plans", f"{name}.toml").read_text("utf-8")
-    return read_plan(name, text, scale)
+    return read_plan(name, _text_of(name), scale)
 
 
 def read_plan(name: str, text: str, scale: Scale) -> Plan:
     """The same from the text of a file. Raises ConfigError."""
     try:
-        plan = Plan.model_validate({"name": name, **tomllib.loads(text)})
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"plan {name}: expected TOML: {error}") from error
+        plan = Plan.model_validate({"name": name, **_tree(name, text)})
     except ValidationError as error:
         raise ConfigError(_one_line(f"plan {name}", error)) from error
     if plan.preset:
@@ -189,6 +183,29 @@ def merged(tree: Tree, over: Mapping[str, Any]) -> Tree:
         both = isinstance(value, Mapping) and isinstance(below, Mapping)
         result[key] = merged(dict(below), value) if both else value  # type: ignore[arg-type]
     return result
+
+
+def _text_of(name: str) -> str:
+    if name not in plan_names():
+        known = ", ".join(plan_names())
+        raise ConfigError(f"experiment: expected one of {known}, got {name!r}")
+    return resources.files("experiments").joinpath("plans", f"{name}.toml").read_text("utf-8")
+
+
+def _tree(name: str, text: str) -> Tree:
+    """The tables of a plan, laid over those of the plan it says it is `like`; lists are replaced."""
+    try:
+        tree = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"plan {name}: expected TOML: {error}") from error
+    like = tree.pop("like", None)
+    if like is None:
+        return tree
+    below = tomllib.loads(_text_of(str(like)))
+    if "like" in below:
+        raise ConfigError(f"plan {name}: like: {like} is itself like {below['like']}")
+    below.pop("thesis", None)  # figures of another experiment
+    return merged(below, tree)
 
 
 def _with_defaults(config: Tree) -> Tree:

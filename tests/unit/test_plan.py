@@ -124,6 +124,18 @@ def test_mini_divides_sizes_and_periods_and_nothing_else() -> None:
     assert full.network.filters == 64
 
 
+def test_a_plan_can_say_what_it_is_like() -> None:
+    plan = read_plan(
+        "other", 'like = "plus-minus"\ntitle = "t"\n[config.memory]\ncapacity = 60', "full"
+    )
+    model = load_plan("plus-minus", "full")
+    assert (plan.title, plan.after, plan.stages) == ("t", model.after, model.stages)
+    assert plan.config["memory"] == {**model.config["memory"], "capacity": 60}
+    assert not plan.thesis  # those figures are the other one's
+    with pytest.raises(ConfigError, match="plus-minus-normm is itself like plus-minus"):
+        read_plan("other", 'like = "plus-minus-normm"', "full")
+
+
 def test_merging_changes_neither_tree() -> None:
     below, over = {"a": {"b": 1, "c": 2}}, {"a": {"b": 3}}
     assert merged(below, over) == {"a": {"b": 3, "c": 2}}
