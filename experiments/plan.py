@@ -193,7 +193,7 @@ def _text_of(name: str) -> str:
 
 
 def _tree(name: str, text: str) -> Tree:
-    """The tables of a plan, laid over those of the plan it says it is `like`; lists are replaced."""
+    """The tables of a plan, laid over those of the one it is `like`; lists are replaced."""
     try:
         tree = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
