@@ -69,15 +69,25 @@ def plan(name: str, **parts: str) -> Plan:
 
 
 FIRST = plan("one")
+GROWING = plan(
+    "growing",
+    fill="capacity_max = 400\ncapacity_step = 100\nrecompute_below = 999\nraise_at_most = 999",
+)
 SECOND = plan("two", after='after = "one"', first="minus", fill='fill = "none"', second_fill="none")
 
 
-def run(a_plan: Plan, folder: Path, before: Path | None = None, turns: int = 10**9) -> bool:
-    """Run so many turns, or to the end; whether it came to it."""
+def run(
+    a_plan: Plan,
+    folder: Path,
+    before: Path | None = None,
+    turns: int = 10**9,
+    episodes: int = 10**9,
+) -> bool:
+    """Run so many turns or episodes, or to the end; whether it came to it."""
     done: list[Progress] = []
     one = Run(a_plan, "full", 1, folder, before, "command")
     try:
-        return one.go(done.append, lambda: len(done) >= turns)
+        return one.go(done.append, lambda: len(done) >= turns or done[-1].episode >= episodes)
     finally:
         one.close()
 
@@ -117,6 +127,18 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(
         assert tables(folder) == tables(finished / name)
         for weights in ("weights.safetensors", "best.safetensors"):
             assert (folder / weights).read_bytes() == (finished / name / weights).read_bytes()
+
+
+def test_a_memory_that_has_grown_is_as_large_after_a_stop(tmp_path: Path) -> None:
+    """A44: the configured capacity counts as its stage begins, not as the run goes on."""
+    whole, parted = tmp_path / "whole" / "growing", tmp_path / "parted" / "growing"
+    assert run(GROWING, whole)
+    for episodes in (4, 5, 6):
+        assert not run(GROWING, parted, episodes=episodes)
+    assert run(GROWING, parted)
+    assert tables(parted) == tables(whole)
+    capacities = [int(row["capacity"]) for row in tables(whole)["episodes"]]
+    assert capacities == [60] * 3 + [250] * 4
 
 
 def test_stages_follow_each_other(finished: Path) -> None:
