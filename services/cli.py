@@ -12,6 +12,7 @@ from __future__ import annotations
 import importlib
 import os
 import re
+import signal
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -482,6 +483,9 @@ def _serve(name: str, package: str, config: Config, folder: Path, tethered: bool
 
     claim(folder, config)
     setup_logging(name, folder)
+
+    # Asked to stop while it starts, a service still comes to its clean end (`shared.service`).
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
 
     def run() -> None:
         import_role(f"services.{package}.service", name).run(config, folder)

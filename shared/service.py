@@ -147,6 +147,7 @@ def service(name: str, ident: str, config: Config, *, life: str | None = None) -
 
     signal.signal(signal.SIGTERM, on_signal)
     signal.signal(signal.SIGINT, on_signal)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     with _connect(name, config, stop) as bus:
         me = Service(name, ident, life or new_life(), config, bus, stop)
         me.meet()
