@@ -7,7 +7,6 @@ last snapshot as if nothing had happened; what was recorded after that snapshot 
 from __future__ import annotations
 
 import json
-import math
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -18,17 +17,13 @@ from typing import Any
 import numpy as np
 
 from experiments import probes, records, routes, snapshot
-from experiments.choosers import greedy
-from experiments.environment import CorridorEnv, with_world
-from experiments.evaluation import drive_from_first_start, evaluate
+from experiments.observer import Observer
 from experiments.plan import Plan, Scale, Stage, stage_config
 from experiments.provenance import machine
 from experiments.recorder import episode_row, memory_hash
-from experiments.references import DRIVERS, reference
+from experiments.references import DRIVERS
 from experiments.single_process import SingleProcess, TurnDone
-from experiments.tour import drive_tour
-from experiments.traces import Figures, first_lap
-from services.robot_driver.robot import Pose
+from experiments.traces import Figures
 from services.robot_driver.sim import SimRobot
 from services.robot_driver.world import load_world
 from shared.config import Config
@@ -36,14 +31,11 @@ from shared.errors import ConfigError, StateError
 from shared.messages import WorldChange
 from shared.numerics import settle
 from shared.rl.network import to_bytes
-from shared.rl.predictor import Predictor
 from shared.settings import claim
 from shared.statefile import write_atomically
 
 SNAPSHOT_EVERY_S = 60.0
 END = "state-end"
-LAP_ACTIONS = 400
-"""A frozen drive that has not gone round by then does not count as one that drives laps."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +48,6 @@ class Progress:
     actions: int
     fitness: float
     """Mean of the last episodes."""
-    activity: str
 
 
 @dataclass
@@ -69,6 +60,10 @@ class Totals:
     """Actions at the last evaluation on the way."""
     lap_checked_at: int = -1
     first_lap: dict[str, float] = field(default_factory=dict)
+    run_actions: int = 0
+    """Since the last bump, in this run."""
+    longest_run: int = 0
+    """Without a bump, in this run (E10)."""
     prefill: str = ""
     """Hash of the memory as the first episode began: equal for all that shared it."""
     stages: list[dict[str, Any]] = field(default_factory=list)
@@ -109,10 +104,8 @@ class Run:
         self._totals = Totals()
         self._stage = 0
         self._offset = 0
-        self._driving = to_bytes(self._loop.trainer.target_network)
-        self._best, self._longest = self._driving, 0
-        self._lookers: dict[str, CorridorEnv] = {}
-        self._frozen = Predictor(first.network, self._numerics.actor)
+        self._driving = self._best = to_bytes(self._loop.trainer.target_network)
+        self._observer = Observer(self._config(0))
         self._fitness: list[int] = []
         self._restore(predecessor)
 
@@ -135,13 +128,12 @@ class Run:
             self._finish()
             return True
         saved_s = began_s = time.monotonic()
-        turns = self._turns()
-        for done in turns:
+        for done in self._turns():
             self._totals.seconds += time.monotonic() - began_s
             self._record(done)
             self._check_lap()
             over = self._advance(done)
-            report(self._progress("learning"))
+            report(self._progress())
             if over:
                 self._finish()
                 return True
@@ -155,8 +147,8 @@ class Run:
 
     def close(self) -> None:
         """Free the simulations."""
-        for env in (self._loop.env, *self._lookers.values()):
-            env.close()
+        self._loop.env.close()
+        self._observer.close()
 
     # ------------------------------------------------------------ stages
 
@@ -188,9 +180,8 @@ class Run:
             self._change(WorldChange.model_validate({**change, "at_episode": at}))
         if stage.force_candidates:
             loop.memory.force_candidates(loop.memory.ids)
-        first = (
-            not self._totals.stages
-        )  # both change on the way: a stage sets them where it says so
+        # Both change on the way: a stage sets them where it says something new.
+        first = not self._totals.stages
         if first or before.memory.threshold_percent != config.memory.threshold_percent:
             loop.threshold_percent = config.memory.threshold_percent
         if first or before.memory.capacity != config.memory.capacity:
@@ -240,10 +231,14 @@ class Run:
         entry["actions"] = counters.actions - entry.pop("first_action")
         entry["train_steps"] = self._loop.trainer.train_steps - entry.pop("first_train_step")
         entry["seconds"] = round(self._totals.seconds - entry.pop("first_second"), 1)
+        self._show()
+        self._take_pictures(stage.name)
+
+    def _take_pictures(self, label: str) -> None:
+        """What the network shown to the observer predicts, in all worlds of the plan."""
         for world in sorted({self._loop.config.robot.world, *self.plan.evaluation.worlds}):
-            self._freeze()
-            path = self.folder / f"probes-{stage.name}-{world}.npz"
-            probes.save(path, probes.look(self._looker(world).robot, self._frozen))
+            path = self.folder / f"probes-{label}-{world}.npz"
+            probes.save(path, self._observer.look(world))
 
     def _finish(self) -> None:
         data = to_bytes(self._loop.trainer.target_network)
@@ -251,7 +246,8 @@ class Run:
         write_atomically(self.folder / "best.safetensors", self._best)
         if self.plan.tours:
             self._drive_tours()
-        self._look_with_best()
+        self._observer.show(self._best)  # of the longest bump-free run (Fig 4.7)
+        self._take_pictures("best")
         self._refer()
         self._write_run(complete=True)
         snapshot.save(self.folder / END, self._loop, self._extra())
@@ -263,31 +259,21 @@ class Run:
     def _evaluate(self, over: bool, worlds: tuple[str, ...]) -> None:
         """Drive frozen: thoroughly at the end of a stage, briefly on the way."""
         settings, rows = self.plan.evaluation, []
-        label = f"stage {self.plan.stages[self._stage].name}" if over else "every"
+        label = f"stage {self._stage_name}" if over else "every"
         starts = settings.starts if over else settings.every_starts
         actions = settings.actions if over else settings.every_length
-        self._freeze()
+        self._show()
         for world in worlds:
-            env, drives = self._looker(world), greedy(self._frozen)
-            evaluated = evaluate(env, drives, starts, actions)
-            rows.append(self._evaluation_row(label, "network", world, evaluated.figures))
+            figures = self._observer.evaluate(world, starts, actions)
+            rows.append(self._evaluation_row(label, "network", world, figures))
         records.append_csv(self.folder / "evaluations.csv", records.EVALUATION_COLUMNS, rows)
-
-    def _look_with_best(self) -> None:
-        """What the weights of the longest bump-free run predict (Fig 4.7)."""
-        self._frozen.load(0, self._best)
-        for world in sorted({self._loop.config.robot.world, *self.plan.evaluation.worlds}):
-            found = probes.look(self._looker(world).robot, self._frozen)
-            probes.save(self.folder / f"probes-best-{world}.npz", found)
 
     def _drive_tours(self) -> None:
         """Test drives with turns on the spot (A45): their routes, and `tours.json` about all."""
-        self._freeze()
-        env = self._looker(self._loop.config.robot.world)
+        self._show()
         told = []
-        for number, start in enumerate(env.robot.world.starts[: self.plan.tours]):
-            pose = Pose(start.x_m, start.y_m, math.radians(start.heading_deg))
-            tour = drive_tour(env, self._frozen, pose, number)
+        tours = self._observer.tours(self._loop.config.robot.world, self.plan.tours)
+        for number, tour in enumerate(tours):
             routes.write(self.folder / f"route-tour-{number}.npz", tour.route)
             told.append(tour.told)
         write_atomically(self.folder / "tours.json", (json.dumps(told, indent=2) + "\n").encode())
@@ -296,16 +282,11 @@ class Run:
         """Record floor and ceiling of all worlds that were driven in, at the end of the record."""
         settings, kept = self.plan.evaluation, self.folder.parents[1] / "references"
         path, columns = self.folder / "evaluations.csv", records.EVALUATION_COLUMNS
-        rows = [
-            self._evaluation_row(
-                "reference",
-                driver,
-                world,
-                reference(self._looker(world), driver, settings.starts, settings.actions, kept),
-            )
-            for world in sorted({row["world"] for row in records.read_csv(path, columns)})
-            for driver in DRIVERS
-        ]
+        drives, rows = (settings.starts, settings.actions), []
+        for world in sorted({row["world"] for row in records.read_csv(path, columns)}):
+            for driver in DRIVERS:
+                figures = self._observer.reference(world, driver, *drives, kept)
+                rows.append(self._evaluation_row("reference", driver, world, figures))
         records.append_csv(path, columns, rows)
 
     def _evaluation_row(self, label: str, driver: str, world: str, figures: Figures) -> records.Row:
@@ -331,10 +312,8 @@ class Run:
         if actions // every <= self._totals.lap_checked_at:
             return
         self._totals.lap_checked_at = actions // every
-        self._freeze()
-        env = self._looker(world.name)
-        trace = drive_from_first_start(env, greedy(self._frozen), LAP_ACTIONS)
-        if first_lap(trace, world) is not None:
+        self._show()
+        if self._observer.drives_lap(world.name):
             self._totals.first_lap = {
                 "seconds": round(self._totals.seconds, 1),
                 "actions": actions,
@@ -347,17 +326,9 @@ class Run:
         """Those of the fill included."""
         return self._loop.actor.actions
 
-    def _freeze(self) -> None:
-        trainer = self._loop.trainer
-        if self._frozen.version != trainer.version:
-            self._frozen.load(trainer.version, to_bytes(trainer.target_network))
-
-    def _looker(self, world: str) -> CorridorEnv:
-        """A robot of our own for frozen drives: those never disturb the one that learns."""
-        if world not in self._lookers:
-            config = with_world(self._loop.config, world)
-            self._lookers[world] = CorridorEnv(config=config, robot=self._robot(world))
-        return self._lookers[world]
+    def _show(self) -> None:
+        """Let the observer look at the target network as it is now."""
+        self._observer.show(to_bytes(self._loop.trainer.target_network))
 
     def _robot(self, world: str) -> SimRobot:
         return SimRobot(self._config(0).robot, load_world(world), self.seed)
@@ -367,13 +338,16 @@ class Run:
     def _record(self, done: TurnDone) -> None:
         if not done.commit.episode:
             return
-        self._fitness = [*self._fitness[-99:], done.submitted.fitness]
-        if self._loop.counters.longest_run_actions > self._longest:
-            self._longest, self._best = self._loop.counters.longest_run_actions, self._driving
+        episode, totals = done.submitted, self._totals
+        self._fitness = [*self._fitness[-99:], episode.fitness]
+        totals.run_actions += episode.actions - int(episode.bump)
+        if totals.run_actions > totals.longest_run:
+            totals.longest_run, self._best = totals.run_actions, self._driving
+        if episode.bump:
+            totals.run_actions = 0
         if done.target_changed:
             self._driving = to_bytes(self._loop.trainer.target_network)
-        stage = self.plan.stages[self._stage].name
-        row = episode_row(self._loop, done, stage, self._totals.seconds)
+        row = episode_row(self._loop, done, self._stage_name, totals.seconds)
         records.append_csv(self.folder / "episodes.csv", records.EPISODE_COLUMNS, [row])
 
     def _write_run(self, *, complete: bool) -> None:
@@ -400,7 +374,7 @@ class Run:
             "actions": counters.actions,
             "fill_actions": self._all_actions - counters.actions,
             "train_steps": self._loop.trainer.train_steps,
-            "longest_run": counters.longest_run_actions,
+            "longest_run": self._totals.longest_run,
             "prefill": self._totals.prefill,
             "first_lap": self._totals.first_lap,
             "stages": self._totals.stages,
@@ -417,7 +391,6 @@ class Run:
             "stage": self._stage,
             "offset": self._offset,
             "best": self._best,
-            "longest": self._longest,
             "fitness": self._fitness,
             "started": self._started,
         }
@@ -447,12 +420,13 @@ class Run:
             snapshot.restore(predecessor / END, self._loop)
             self._offset = self._loop.counters.episode
         self._driving = to_bytes(self._loop.trainer.target_network)
-        self._drop_unsaved()
+        if not self.complete:
+            self._drop_unsaved()
 
     def _take_up(self, extra: dict[str, Any]) -> None:
         self._totals = Totals(**extra["totals"])
         self._stage, self._offset = int(extra["stage"]), int(extra["offset"])
-        self._best, self._longest = extra["best"], int(extra["longest"])
+        self._best = extra["best"]
         self._fitness = list(extra["fitness"])
         self._started = str(extra["started"])
         if self._stage < len(self.plan.stages):
@@ -469,7 +443,7 @@ class Run:
             rows = [r for r in records.read_csv(path, columns) if int(r["episode"]) <= newest]
             records.write_csv(path, columns, rows)
 
-    def _progress(self, activity: str) -> Progress:
+    def _progress(self) -> Progress:
         episode = self._loop.counters.episode - self._offset
         return Progress(
             run=f"{self.plan.name} {self.seed}",
@@ -477,7 +451,6 @@ class Run:
             episodes=self.plan.stages[-1].until if self.plan.stages else 0,
             actions=self._all_actions,
             fitness=float(np.mean(self._fitness)) if self._fitness else 0.0,
-            activity=activity,
         )
 
 

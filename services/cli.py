@@ -9,21 +9,21 @@ lies on disk is damaged or does not belong to this run.
 
 from __future__ import annotations
 
-import importlib
-import os
 import re
-import signal
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from services.cli_worlds import obstacle, world
 from services.monitor.tether import tether
 from services.options import (
     CHOOSE,
-    AtEpisode,
+    EXIT_CONFIG,
+    EXIT_CRASH,
+    EXIT_STATE,
     ConfigFile,
     Endpoint,
     Preset,
@@ -33,6 +33,9 @@ from services.options import (
     Seed,
     Set,
     Tethered,
+    import_role,
+    load,
+    reach,
 )
 from shared.errors import ConfigError, CorridorError, StateError
 
@@ -40,7 +43,6 @@ if TYPE_CHECKING:
     from services.monitor.operator import Command
     from shared.config import Config
 
-EXIT_CRASH, EXIT_CONFIG, EXIT_STATE = 1, 2, 3
 UsageError: Any = typer.BadParameter.__mro__[2]
 """Base of all complaints about the command line, wherever this version of Typer keeps Click."""
 
@@ -51,11 +53,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-world = typer.Typer(
-    help="Look at simulated worlds, and let robots drive in another.", no_args_is_help=True
-)
 app.add_typer(world, name="world")
-obstacle = typer.Typer(help="Place and remove boxes where robots drive.", no_args_is_help=True)
 app.add_typer(obstacle, name="obstacle")
 
 
@@ -98,7 +96,7 @@ def _service_command(name: str, package: str, text: str) -> None:
         endpoint: Endpoint = None,
         tethered: Tethered = False,
     ) -> None:
-        loaded = _load(preset, config, set_, run, seed, endpoint)
+        loaded = load(preset, config, set_, run, seed, endpoint)
         raise typer.Exit(_serve(name, package, loaded, run_dir or _folder(loaded), tethered))
 
     app.command(name, help=text)(command)
@@ -135,7 +133,7 @@ def router(
     tethered: Tethered = False,
 ) -> None:
     """Run a Zenoh router; the first line on standard output is where it listens."""
-    loaded = _load(preset, config, set_, endpoint=listen)
+    loaded = load(preset, config, set_, endpoint=listen)
     if tethered:
         tether()
     from services.router.service import run as route
@@ -175,7 +173,7 @@ def up(
     Ctrl-C stops everything within five seconds; the same command continues the run. All that a
     run produces lies in its folder.
     """
-    loaded = _load(preset, config, set_, run, seed, endpoint, {"run.episodes": episodes})
+    loaded = load(preset, config, set_, run, seed, endpoint, {"run.episodes": episodes})
     from services.monitor.up import run_all
 
     code = run_all(loaded, run_dir or _folder(loaded), listen=listen, given=endpoint is not None)
@@ -202,7 +200,7 @@ def status(
     """List the services of a run that are alive, with versions, rates and memory."""
     from services.monitor.status import show
 
-    raise typer.Exit(show(_reach(run, run_dir, endpoint), as_json=as_json, require=require or []))
+    raise typer.Exit(show(reach(run, run_dir, endpoint), as_json=as_json, require=require or []))
 
 
 @app.command()
@@ -218,7 +216,7 @@ def stop(
     """Ask the services of a run to stop cleanly; `corridor up` ends with them."""
     from services.monitor.operator import stop_services
 
-    raise typer.Exit(stop_services(_reach(run, run_dir, endpoint), service or []))
+    raise typer.Exit(stop_services(reach(run, run_dir, endpoint), service or []))
 
 
 def _robot_command(name: Command, text: str) -> None:
@@ -229,7 +227,7 @@ def _robot_command(name: Command, text: str) -> None:
     ) -> None:
         from services.monitor.operator import command_robots
 
-        raise typer.Exit(command_robots(_reach(run, run_dir, endpoint), name, robot))
+        raise typer.Exit(command_robots(reach(run, run_dir, endpoint), name, robot))
 
     app.command(name, help=text)(command)
 
@@ -240,69 +238,6 @@ _robot_command("pause", "Let robots wait after the current action, until `corrid
 _robot_command("resume", "Let paused robots drive on.")
 
 
-@world.command("switch")
-def world_switch(
-    name: Annotated[str, typer.Argument(help="World to drive in, such as minus.")],
-    start: Annotated[int, typer.Option(min=0, help="Which of its start poses.")] = 0,
-    at_episode: AtEpisode = 0,
-    run: Run = None,
-    run_dir: RunDir = None,
-    endpoint: Endpoint = None,
-    robot: Robot = None,
-) -> None:
-    """Let robots of a running simulation go on in another world.
-
-    Samples that look ahead across the change are dropped and counted.
-    """
-    change = {"kind": "switch", "world": name, "start": start, "at_episode": at_episode}
-    raise typer.Exit(_change_world(run, run_dir, endpoint, robot, change))
-
-
-@obstacle.command("place")
-def obstacle_place(
-    name: Annotated[str, typer.Argument(help="Name of the box, to remove it by.")],
-    x: Annotated[float, typer.Option(help="Of its middle, m.")],
-    y: Annotated[float, typer.Option(help="Of its middle, m.")],
-    heading_deg: Annotated[float, typer.Option(help="Direction of its length.")] = 0.0,
-    length: Annotated[float, typer.Option(help="m.")] = 0.5,
-    width: Annotated[float, typer.Option(help="m.")] = 0.5,
-    height: Annotated[float, typer.Option(help="m.")] = 0.5,
-    rgb: Annotated[tuple[int, int, int], typer.Option(help="Colour, 0..255 each.")] = (200, 60, 40),
-    at_episode: AtEpisode = 0,
-    run: Run = None,
-    run_dir: RunDir = None,
-    endpoint: Endpoint = None,
-    robot: Robot = None,
-) -> None:
-    """Let a box stand in the world of a running simulation: solid, and seen."""
-    box = {
-        "name": name,
-        "x_m": x,
-        "y_m": y,
-        "heading_deg": heading_deg,
-        "length_m": length,
-        "width_m": width,
-        "height_m": height,
-        "rgb": rgb,
-    }
-    change = {"kind": "place", "box": box, "at_episode": at_episode}
-    raise typer.Exit(_change_world(run, run_dir, endpoint, robot, change))
-
-
-@obstacle.command("remove")
-def obstacle_remove(
-    name: Annotated[str, typer.Argument(help="Name of the box.")],
-    at_episode: AtEpisode = 0,
-    run: Run = None,
-    run_dir: RunDir = None,
-    endpoint: Endpoint = None,
-    robot: Robot = None,
-) -> None:
-    """Take a box away again, one that was placed or one that belongs to the world."""
-    change = {"kind": "remove", "name": name, "at_episode": at_episode}
-    raise typer.Exit(_change_world(run, run_dir, endpoint, robot, change))
-
-
 # ---------------------------------------------------------------- without a run
 
 
@@ -311,7 +246,10 @@ def show_config(preset: Preset = None, config: ConfigFile = None, set_: Set = No
     """Print the resolved configuration as TOML, every key with its value."""
     from shared.settings import to_toml
 
-    typer.echo(to_toml(_load(preset, config, set_)), nl=False)
+    typer.echo(to_toml(load(preset, config, set_)), nl=False)
+
+
+# ---------------------------------------------------------------- experiments
 
 
 @app.command()
@@ -341,58 +279,6 @@ def experiment(
         typer.echo(commands.listing())
         return
     raise typer.Exit(commands.run(names, scale, seeds, seed, jobs, out))
-
-
-WorldName = Annotated[
-    str, typer.Argument(help="Name of the world, such as plus, or path of a world file.")
-]
-
-
-@world.command("list")
-def world_list() -> None:
-    """List the worlds that come along and those in the folder worlds/."""
-    worlds = import_role("services.robot_driver.world", "driver")
-    for name, path in worlds.world_files().items():
-        loaded = worlds.read_world(path)
-        x0, y0, x1, y1 = loaded.bounds
-        laps = "laps" if loaded.lap else "no laps"
-        size = f"{x1 - x0:.1f} x {y1 - y0:.1f} m"
-        typer.echo(f"{name:16} {size:14} {laps:8} {path}  {loaded.title}")
-
-
-@world.command("render")
-def world_render(
-    name: WorldName,
-    out: Annotated[Path, typer.Option(help="Folder for the PNG files.")] = Path("renders"),
-) -> None:
-    """Write a top view and camera views of a world as PNG files."""
-    views = import_role("services.robot_driver.views", "driver")
-    views.render(name, out)
-    typer.echo(f"written to {out}")
-
-
-@world.command("check")
-def world_check(
-    name: WorldName,
-    preset: Preset = None,
-    config: ConfigFile = None,
-    set_: Set = None,
-) -> None:
-    """Print what is wrong with a world (exit code 1), or measure it: how hard it is, laps, tour."""
-    worlds = import_role("services.robot_driver.world", "driver")
-    survey = import_role("services.robot_driver.survey", "driver")
-    path = worlds.world_path(name)
-    loaded = _load(preset, config, set_, others={"robot.world": path.stem})
-    problems = survey.problems_in(path, loaded)
-    for line in problems:
-        typer.echo(line)
-    if problems:
-        raise typer.Exit(EXIT_CRASH)
-    for key, value in survey.survey(loaded, worlds.read_world(path)).items():
-        typer.echo(f"{key:40} {value:.3f}" if isinstance(value, float) else f"{key:40} {value}")
-
-
-# ---------------------------------------------------------------- experiments
 
 
 @app.command()
@@ -438,35 +324,13 @@ def evaluate(
     """
     command = import_role("experiments.evaluate", "experiments")
     file = config or command.configuration_of(run)
-    loaded = _load(None, file, set_, others={"robot.world": world})
+    loaded = load(None, file, set_, others={"robot.world": world})
     folder = out or Path(f"evaluation-{loaded.robot.world}")
     command.run(run, loaded, starts, actions, folder)
     typer.echo(f"written to {folder}")
 
 
 # ---------------------------------------------------------------- shared by the commands
-
-
-def _load(
-    preset: str | None = None,
-    file: Path | None = None,
-    sets: list[str] | None = None,
-    run: str | None = None,
-    seed: int | None = None,
-    endpoint: str | None = None,
-    others: Mapping[str, str | int | None] | None = None,
-) -> Config:
-    """The configuration from all sources; dedicated options win over `--set`."""
-    from shared import settings
-
-    options: dict[str, str | int | None] = {
-        "run.name": run,
-        "run.seed": seed,
-        "bus.endpoint": endpoint,
-    }
-    options.update(others or {})
-    chosen = [f"{k}={settings.toml_value(v)}" for k, v in options.items() if v is not None]
-    return settings.load(preset, file, [*(sets or []), *chosen], os.environ)
 
 
 def _folder(config: Config) -> Path:
@@ -478,53 +342,17 @@ def _serve(name: str, package: str, config: Config, folder: Path, tethered: bool
     """Run one service until it stops; returns its exit code."""
     if tethered:
         tether()
-    from shared.service import guarded, setup_logging
+    from shared.service import guarded, setup_logging, starting
     from shared.settings import claim
 
     claim(folder, config)
     setup_logging(name, folder)
 
-    # Asked to stop while it starts, a service still comes to its clean end (`shared.service`).
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
-
     def run() -> None:
-        import_role(f"services.{package}.service", name).run(config, folder)
+        with starting():
+            import_role(f"services.{package}.service", name).run(config, folder)
 
     return guarded(name, run)
-
-
-def import_role(module: str, role: str) -> Any:
-    """A module of ours. Raises ConfigError when a library of this role is not installed."""
-    try:
-        return importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] in {"experiments", "services", "shared"}:
-            raise
-        extra = "sim" if role == "driver" else role
-        raise ConfigError(
-            f"{role}: needs the Python package {error.name}, which is not installed: "
-            f"pip install 'corridor[{extra}]'"
-        ) from error
-
-
-def _change_world(
-    run: str | None,
-    run_dir: Path | None,
-    endpoint: str | None,
-    robot: str | None,
-    change: dict[str, Any],
-) -> int:
-    """Wish for a change of the world of a run's robots; returns the exit code."""
-    from services.monitor.operator import change_world
-
-    return change_world(_reach(run, run_dir, endpoint), robot, **change)
-
-
-def _reach(run: str | None, run_dir: Path | None, endpoint: str | None) -> Config:
-    """How to reach a running run."""
-    from services.monitor.running import reach
-
-    return reach(run_dir, run, endpoint, os.environ)
 
 
 if __name__ == "__main__":

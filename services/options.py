@@ -1,12 +1,21 @@
-"""Options that several commands share, with one meaning and one help text each."""
+"""Options that several commands share, with one meaning and one help text each, and their use."""
 
 from __future__ import annotations
 
+import importlib
+import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from shared.errors import ConfigError
+
+if TYPE_CHECKING:
+    from shared.config import Config
+
+EXIT_CRASH, EXIT_CONFIG, EXIT_STATE = 1, 2, 3
 OURS, CHOOSE = "Configuration", "Which run"
 Preset = Annotated[
     str | None,
@@ -61,3 +70,46 @@ AtEpisode = Annotated[
         min=0, help="Wait until the robot has finished so many episodes; 0: change it now."
     ),
 ]
+
+
+def load(
+    preset: str | None = None,
+    file: Path | None = None,
+    sets: list[str] | None = None,
+    run: str | None = None,
+    seed: int | None = None,
+    endpoint: str | None = None,
+    others: Mapping[str, str | int | None] | None = None,
+) -> Config:
+    """The configuration from all sources; dedicated options win over `--set`."""
+    from shared import settings
+
+    options: dict[str, str | int | None] = {
+        "run.name": run,
+        "run.seed": seed,
+        "bus.endpoint": endpoint,
+    }
+    options.update(others or {})
+    chosen = [f"{k}={settings.toml_value(v)}" for k, v in options.items() if v is not None]
+    return settings.load(preset, file, [*(sets or []), *chosen], os.environ)
+
+
+def reach(run: str | None, run_dir: Path | None, endpoint: str | None) -> Config:
+    """How to reach a running run."""
+    from services.monitor import running
+
+    return running.reach(run_dir, run, endpoint, os.environ)
+
+
+def import_role(module: str, role: str) -> Any:
+    """A module of ours. Raises ConfigError when a library of this role is not installed."""
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if (error.name or "").split(".")[0] in {"experiments", "services", "shared"}:
+            raise
+        extra = "sim" if role == "driver" else role
+        raise ConfigError(
+            f"{role}: needs the Python package {error.name}, which is not installed: "
+            f"pip install 'corridor[{extra}]'"
+        ) from error

@@ -138,6 +138,20 @@ class StopFlag:
 
 
 @contextmanager
+def starting() -> Iterator[None]:
+    """Hold SIGTERM back until `service` can answer it, or until the end if it never comes so far.
+
+    A service asked to stop while it builds its world or reads its memory comes to the same clean
+    end as later.
+    """
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+
+
+@contextmanager
 def service(name: str, ident: str, config: Config, *, life: str | None = None) -> Iterator[Service]:
     """Connect, meet the others and become visible; stop threads and close the bus at the end."""
     stop = StopFlag()

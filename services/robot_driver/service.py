@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +16,7 @@ from shared.config import Config
 from shared.errors import ConfigError, StateError
 from shared.keys import ACTION, OBSERVATION, ROBOT_COMMAND, ROBOT_STATE, ROBOT_WORLD
 from shared.messages import Action, Observation, RobotCommand, WorldChange
-from shared.service import TICK_S, Service, new_life, service
+from shared.service import TICK_S, Service, Stopped, new_life, service
 
 if TYPE_CHECKING:
     from services.robot_driver.sim import Laps, SimRobot
@@ -46,7 +47,8 @@ def run(config: Config, folder: Path) -> None:
     try:
         _restore(driver, own)
         driver.keep = functools.partial(statefile.save, own / WORLD)
-        with service("driver", config.robot.id, config, life=driver.life) as me:
+        # Stopped before it was up, it has driven nothing, but has taken up what was saved.
+        with suppress(Stopped), service("driver", config.robot.id, config, life=driver.life) as me:
             loop = DriverLoop(me, driver, folder)
             try:
                 loop.run()
@@ -54,7 +56,7 @@ def run(config: Config, folder: Path) -> None:
                 driver.halt()
                 driver.state = "stopped"
                 loop.beat(force=True)
-            statefile.save(own / STATE, driver.saved())
+        statefile.save(own / STATE, driver.saved())
     finally:
         driver.halt()
         robot.close()

@@ -187,6 +187,31 @@ def test_pictures_are_looked_at_as_every_stage_ends_and_with_the_best_weights(
     assert found == {"probes-a-minus.npz", "probes-b-plus.npz", "probes-best-plus.npz"}
 
 
+def test_the_longest_run_is_that_of_this_plan_alone(finished: Path) -> None:
+    """A46: not that of a predecessor, whose weights are others."""
+    for name in ("one", "two"):
+        longest = length = 0
+        for row in tables(finished / name)["episodes"]:
+            length += int(row["actions"]) - int(row["bump"])
+            longest = max(longest, length)
+            length = 0 if row["bump"] == "1" else length
+        record = json.loads((finished / name / "run.json").read_text())
+        assert record["longest_run"] == longest
+
+
+def test_a_finished_run_is_left_alone(finished: Path) -> None:
+    def files() -> dict[str, tuple[bytes, int]]:
+        return {
+            path.name: (path.read_bytes(), path.stat().st_mtime_ns)
+            for path in (finished / "two").iterdir()
+            if path.is_file()
+        }
+
+    before = files()
+    assert run(SECOND, finished / "two", finished / "one")
+    assert files() == before
+
+
 def test_a_run_without_its_predecessor_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StateError, match="one, which has not been run to its end"):
         run(SECOND, tmp_path / "two", tmp_path / "one")

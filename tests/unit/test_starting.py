@@ -1,0 +1,59 @@
+"""A service that is asked to stop while it starts comes to a clean end, and loses nothing."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from services.robot_driver import service as driver_service
+from services.robot_driver.driver import Driver
+from shared import statefile
+from shared.config import Config
+from shared.service import Stopped, starting
+
+
+def test_sigterm_waits_until_the_service_can_answer_it() -> None:
+    answered: list[str] = []
+    before = signal.signal(signal.SIGTERM, lambda *_: answered.append("service"))
+    try:
+        with starting():
+            os.kill(os.getpid(), signal.SIGTERM)
+            assert not answered
+            # What `service` does as soon as its handlers are there.
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+            assert answered == ["service"]
+        with starting():
+            os.kill(os.getpid(), signal.SIGTERM)
+        assert answered == ["service", "service"]  # it never came so far: answered at the end
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def test_a_driver_stopped_before_it_is_up_keeps_what_it_was_to_continue(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = Config()
+    path = tmp_path / "robot" / config.robot.id / driver_service.STATE
+    robot = driver_service.make_robot(config)
+    driver = Driver(config, robot, "a" * 12)
+    for action in (0, 1, 1, 2):
+        driver.execute(action)
+    saved = driver.saved()
+    robot.close()
+    statefile.save(path, saved)
+
+    @contextmanager
+    def never_up(*_: Any, **__: Any) -> Iterator[Any]:
+        assert not path.exists()  # it has been taken up
+        raise Stopped("waiting for the router")
+        yield
+
+    monkeypatch.setattr(driver_service, "service", never_up)
+    driver_service.run(config, tmp_path)
+    assert statefile.read(path) == saved
