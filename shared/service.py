@@ -137,31 +137,42 @@ class StopFlag:
         self._wakes.append(wake)
 
 
+_held: list[int] = []
+"""Signals that came while this process's service was starting."""
+
+
 @contextmanager
 def starting() -> Iterator[None]:
-    """Hold SIGTERM back until `service` can answer it, or until the end if it never comes so far.
+    """Hold SIGTERM back until `answer_signals`.
 
     A service asked to stop while it builds its world or reads its memory comes to the same clean
     end as later.
     """
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+    _held.clear()
+    before = signal.signal(signal.SIGTERM, lambda number, _: _held.append(number))
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+        signal.signal(signal.SIGTERM, before)
 
 
-@contextmanager
-def service(name: str, ident: str, config: Config, *, life: str | None = None) -> Iterator[Service]:
-    """Connect, meet the others and become visible; stop threads and close the bus at the end."""
-    stop = StopFlag()
+def answer_signals(stop: StopFlag) -> None:
+    """Let SIGTERM and SIGINT set the flag from now on, and one that was held back do it now."""
 
     def on_signal(number: int, _: FrameType | None) -> None:
         stop.set(signal.Signals(number).name)
 
     signal.signal(signal.SIGTERM, on_signal)
     signal.signal(signal.SIGINT, on_signal)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+    for number in _held:
+        on_signal(number, None)
+
+
+@contextmanager
+def service(name: str, ident: str, config: Config, *, life: str | None = None) -> Iterator[Service]:
+    """Connect, meet the others and become visible; stop threads and close the bus at the end."""
+    stop = StopFlag()
+    answer_signals(stop)
     with _connect(name, config, stop) as bus:
         me = Service(name, ident, life or new_life(), config, bus, stop)
         me.meet()

@@ -15,24 +15,36 @@ from services.robot_driver import service as driver_service
 from services.robot_driver.driver import Driver
 from shared import statefile
 from shared.config import Config
-from shared.service import Stopped, starting
+from shared.service import StopFlag, Stopped, answer_signals, starting
 
 
+@pytest.fixture
+def _signals_as_before() -> Iterator[None]:
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("_signals_as_before")
 def test_sigterm_waits_until_the_service_can_answer_it() -> None:
-    answered: list[str] = []
-    before = signal.signal(signal.SIGTERM, lambda *_: answered.append("service"))
-    try:
-        with starting():
-            os.kill(os.getpid(), signal.SIGTERM)
-            assert not answered
-            # What `service` does as soon as its handlers are there.
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
-            assert answered == ["service"]
-        with starting():
-            os.kill(os.getpid(), signal.SIGTERM)
-        assert answered == ["service", "service"]  # it never came so far: answered at the end
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    stop = StopFlag()
+    with starting():
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert not stop.is_set()
+        answer_signals(stop)
+        assert stop.is_set()
+    assert stop.reason == "SIGTERM"
+
+
+@pytest.mark.usefixtures("_signals_as_before")
+def test_what_an_earlier_start_held_back_is_forgotten() -> None:
+    with starting():
+        os.kill(os.getpid(), signal.SIGTERM)
+    stop = StopFlag()
+    with starting():
+        answer_signals(stop)
+    assert not stop.is_set()
 
 
 def test_a_driver_stopped_before_it_is_up_keeps_what_it_was_to_continue(
