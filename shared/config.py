@@ -72,11 +72,67 @@ class CameraConfig(Section):
     render_height_px: int = Field(default=50, ge=50, le=1080)
 
 
+class HardwareConfig(Section):
+    """A real robot, whatever its kind: how fresh readings must be, how often commands are sent."""
+
+    command_period_s: float = Field(default=0.1, gt=0.01, le=0.5)
+    """The velocity in force is sent again this often: below the robot's own watchdog."""
+    camera_stale_s: float = Field(default=1.0, gt=0.0, le=5.0)
+    """The robot stands still while its newest picture is older."""
+    odometry_stale_s: float = Field(default=0.5, gt=0.0, le=5.0)
+    """The robot stands still while its newest odometry is older."""
+    bumper_stale_s: float = Field(default=0.5, gt=0.0, le=5.0)
+    """The robot stands still while its newest bumper reading is older: silence is no all-clear."""
+    open_timeout_s: float = Field(default=10.0, gt=0.0, le=120.0)
+    """The service ends when robot and sensors have not all answered by then."""
+
+
+class RobotinoConfig(Section):
+    """A Festo Robotino 3 or 4 over its REST interface."""
+
+    address: str = Field(default="172.26.1.1:80", min_length=1)
+    """Host, or host:port."""
+    camera_period_s: float = Field(default=0.1, gt=0.0, le=1.0)
+    sensor_period_s: float = Field(default=0.1, gt=0.0, le=1.0)
+    """Of bumper and odometry."""
+    battery_period_s: float = Field(default=5.0, gt=0.0, le=60.0)
+    timeout_s: float = Field(default=0.25, gt=0.0, le=5.0)
+    """Of one request, and of one command."""
+
+
+class Ros2Config(Section):
+    """A ROS 2 robot over Zenoh: through zenoh-bridge-ros2dds, or natively through rmw_zenoh."""
+
+    endpoint: str = Field(default="tcp/127.0.0.1:7447", min_length=5)
+    """The bridge, or the router of rmw_zenoh, on the robot."""
+    transport: Literal["bridge", "rmw-zenoh"] = "bridge"
+    domain: int = Field(default=0, ge=0, le=232)
+    """ROS_DOMAIN_ID; rmw-zenoh only."""
+    distribution: Literal["humble", "jazzy"] = "jazzy"
+    """Humble has no type hashes in its keys; rmw-zenoh only."""
+    namespace: str = Field(default="", pattern=r"^([A-Za-z_][A-Za-z0-9_/]*)?$")
+    """Before every topic, without a leading slash."""
+    velocity_topic: str = Field(default="cmd_vel", pattern=r"^[A-Za-z_][A-Za-z0-9_/]*$")
+    velocity_type: Literal["auto", "Twist", "TwistStamped"] = "auto"
+    """auto: what the network says the robot listens for."""
+    odometry_topic: str = Field(default="odom", pattern=r"^[A-Za-z_][A-Za-z0-9_/]*$")
+    camera_topic: str = Field(default="image_raw", pattern=r"^[A-Za-z_][A-Za-z0-9_/]*$")
+    camera_type: Literal["Image", "CompressedImage"] = "Image"
+    bumper_topic: str = Field(default="bumper", pattern=r"^[A-Za-z_][A-Za-z0-9_/]*$")
+    bumper_type: Literal["Bool", "HazardDetectionVector"] = "Bool"
+    bumper_on_change: bool = False
+    """The robot publishes its bumper on change only: odometry then shows that it still talks."""
+    battery_topic: str = Field(default="", pattern=r"^([A-Za-z_][A-Za-z0-9_/]*)?$")
+    """Empty: none."""
+    battery_type: Literal["BatteryState", "PowerReadings"] = "BatteryState"
+
+
 class RobotConfig(Section):
     """The robot, its motion, and the limits its driver enforces whatever the network says."""
 
     id: Name = "robotino1"
-    kind: Literal["sim"] = "sim"
+    kind: Literal["sim", "robotino", "ros2"] = "sim"
+    """The PyBullet simulation, or a real robot: its section below says how to reach it."""
     timing: Literal["lockstep", "realtime"] = "lockstep"
     """lockstep: simulated time stands still until the action has come; realtime: fixed period."""
     world: Name = "plus"
@@ -101,6 +157,9 @@ class RobotConfig(Section):
     radius_m: float = Field(default=0.225, gt=0.0, le=1.0)
     """Round shell with the ring bumper."""
     camera: CameraConfig = CameraConfig()
+    hardware: HardwareConfig = HardwareConfig()
+    robotino: RobotinoConfig = RobotinoConfig()
+    ros2: Ros2Config = Ros2Config()
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -113,6 +172,10 @@ class RobotConfig(Section):
             raise ValueError(
                 f"robot.turn_rad_s ({self.turn_rad_s}) must not exceed robot.max_turn_rad_s "
                 f"({self.max_turn_rad_s})"
+            )
+        if self.kind != "sim" and self.timing != "realtime":
+            raise ValueError(
+                f"robot.kind '{self.kind}' needs robot.timing 'realtime', got '{self.timing}'"
             )
         if self.deadman_s < self.period_s:
             raise ValueError(
