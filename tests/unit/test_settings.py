@@ -64,7 +64,10 @@ def test_every_preset_is_valid_and_lists_differences_only(name: str) -> None:
         ("memory.capacity=lots", ["memory.capacity: expected a valid integer, got 'lots'"]),
         ("memory.capacity=3", ["memory.capacity: expected greater than or equal to 30, got 3"]),
         ("memory.protect_terminal=1", ["memory.protect_terminal: expected a valid boolean, got 1"]),
-        ("robot.kind=ros", ["robot.kind: expected 'sim', got 'ros'"]),
+        (
+            "robot.kind=ros",
+            ["robot.kind: expected one of 'sim', 'robotino', 'ros2', got 'ros'"],
+        ),
         ("robot.speed_m_s=nan", ["robot.speed_m_s: expected a finite number, got nan"]),
         ("run.name=A/B", ["run.name: expected a text to match pattern", "got 'A/B'"]),
         ("network.filters=24", ["memory.strategy 'rmm' needs", "24", "memory.strategy: default"]),
