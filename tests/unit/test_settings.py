@@ -66,7 +66,7 @@ def test_every_preset_is_valid_and_lists_differences_only(name: str) -> None:
         ("memory.protect_terminal=1", ["memory.protect_terminal: expected a valid boolean, got 1"]),
         (
             "robot.kind=ros",
-            ["robot.kind: expected one of 'sim', 'robotino', 'ros2', got 'ros'"],
+            ["robot.kind: expected 'sim', 'robotino' or 'ros2', got 'ros'"],
         ),
         ("robot.speed_m_s=nan", ["robot.speed_m_s: expected a finite number, got nan"]),
         ("run.name=A/B", ["run.name: expected a text to match pattern", "got 'A/B'"]),
