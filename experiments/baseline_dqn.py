@@ -1,16 +1,17 @@
 """A baseline: DQN of Stable-Baselines3 learns in the same corridor, evaluated as ours is (E34).
 
-Equal are the environment, the convolutions with their first weights, memory, mini-batch, constant
-exploration, the random actions before learning, and the number of actions. Different are what makes
-it DQN: one output per action instead of actions as an input, a discount factor and bootstrapped
-values, and its optimiser and update frequencies, which are Stable-Baselines3's defaults except for
-the target network, copied every 1,000 actions because runs are short.
+Equal to a plan of ours are the environment, the convolutions with their first weights, memory,
+mini-batch, constant exploration, the random actions before learning, and the number of actions.
+Different are what makes it DQN: one output per action instead of actions as an input, a discount
+factor and bootstrapped values, and its optimiser and update frequencies, which are
+Stable-Baselines3's defaults except for the target network, copied every 1,000 actions because runs
+are short.
 
 Reward `progress` is the environment's own: how far the action led, -1 at a bump. It does not tell
 driving from circling. Reward `distance` comes nearer to ours: how far the robot is from where it
 was 50 actions ago, of the farthest possible.
 
-    python -m experiments.baseline_dqn --world plus --actions 50000 --seed 1 --out DIR
+    python -m experiments.baseline_dqn --like plus-rmm --actions 50000 --seed 1 --out DIR
 
 needs Stable-Baselines3 (`make bench-peers` installs it into `.venv-peers`).
 """
@@ -37,14 +38,18 @@ from gymnasium.wrappers import TimeLimit
 from experiments.choosers import Chooser
 from experiments.environment import CorridorEnv, Image
 from experiments.evaluation import evaluate
+from experiments.plan import SCALES, Scale, load_plan, stage_config
 from experiments.provenance import machine
 from experiments.records import EVALUATION_COLUMNS, append_csv, write_csv
 from services.robot_driver.world import WorldError
 from shared.config import Config
+from shared.errors import ConfigError
 from shared.statefile import write_atomically
 
-NAME, STAGE = "dqn", "learn"
-REWARDS = ("progress", "distance")
+NAMES = {"progress": "dqn-progress", "distance": "dqn-distance"}
+"""Of the experiment, by its reward."""
+STAGE = "learn"
+REWARDS = tuple(NAMES)
 TARGET_EVERY = 1000
 """Actions between copies of the target network."""
 EVALUATIONS = 10
@@ -76,6 +81,8 @@ class Plan:
     """What to run."""
 
     config: Config
+    scale: Scale
+    factor: int
     actions: int
     reward: str
     starts: int
@@ -187,10 +194,10 @@ def _told(plan: Plan, learner: Learner, seconds: float, began: str) -> bytes:
         "seconds": round(seconds, 1), **counts,
     }  # fmt: skip
     told = {
-        "experiment": NAME,
+        "experiment": NAMES[plan.reward],
         "title": f"DQN of Stable-Baselines3, reward {plan.reward}",
-        "scale": "full",
-        "factor": 1,
+        "scale": plan.scale,
+        "factor": plan.factor,
         "seed": plan.config.run.seed,
         "command": plan.command,
         "commit": made["commit"],
@@ -212,7 +219,10 @@ def _told(plan: Plan, learner: Learner, seconds: float, began: str) -> bytes:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the baseline; returns the exit code."""
     words = sys.argv[1:] if arguments is None else list(arguments)
-    plan = planned(words)
+    try:
+        plan = planned(words)
+    except ConfigError as error:
+        return _refused(str(error))
     if importlib.util.find_spec("stable_baselines3") is None:
         return _refused("stable_baselines3 is not installed: make bench-peers, then .venv-peers")
     try:
@@ -224,35 +234,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def planned(words: Sequence[str]) -> Plan:
-    """The plan that the command line asks for."""
+    """The plan that the command line asks for. Raises ConfigError."""
     parser = argparse.ArgumentParser(
         prog="python -m experiments.baseline_dqn", description=(__doc__ or "").split("\n")[0]
     )
-    parser.add_argument("--world", default="plus")
+    parser.add_argument("--like", default="plus-rmm", help="plan: world, network and memory")
+    parser.add_argument("--scale", choices=SCALES, default="mini", help="of the plan")
     parser.add_argument("--actions", type=_positive, default=50_000, help="after the random ones")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--filters", type=_positive, default=16, help="per convolution")
-    parser.add_argument("--memory", type=_positive, default=6000, help="filled at random first")
     parser.add_argument("--reward", choices=REWARDS, default=REWARDS[0])
     parser.add_argument("--starts", type=_positive, default=16, help="drives of an evaluation")
     parser.add_argument("--drive-actions", type=_positive, default=400, help="of each drive")
     parser.add_argument("--threads", type=_positive, default=1)
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args(words)
+    like = load_plan(given.like, given.scale)
+    ours = stage_config(like, len(like.stages) - 1, given.seed)
     config = Config.model_validate(
         {
-            "run": {"name": NAME, "seed": given.seed},
-            "robot": {"world": given.world},
-            "policy": {"kind": "eps-greedy"},
-            "network": {"filters": given.filters},
-            "memory": {"capacity": given.memory, "strategy": "normm"},
+            "run": {"name": NAMES[given.reward], "seed": given.seed},
+            "robot": ours.robot.model_dump(),
+            "episode": ours.episode.model_dump(),
+            "policy": {"kind": "eps-greedy", "epsilon": ours.policy.epsilon},
+            "network": ours.network.model_dump(),
+            "memory": {"capacity": ours.memory.capacity, "strategy": "normm"},
             "numerics": {"learner": {"threads": given.threads}},
         }
     )
     command = shlex.join(["python", "-m", "experiments.baseline_dqn", *words])
     return Plan(
-        config, given.actions, given.reward, given.starts, given.drive_actions, given.out, command
-    )
+        config, given.scale, like.mini.factor if given.scale == "mini" else 1, given.actions,
+        given.reward, given.starts, given.drive_actions, given.out, command,
+    )  # fmt: skip
 
 
 def _positive(text: str) -> int:

@@ -22,8 +22,6 @@ from experiments.runs import Experiment
 
 POLICY = "policy-"
 """Experiments whose name begins so are rows of the table of policies (Fig 4.2)."""
-BASELINES = ("dqn",)
-"""Other methods: without a scale of their own, compared at every scale by actions driven."""
 PROBES_SHOWN = 6
 EXPECTED_BEST_FIRST = (
     "plus-rmm", "plus-rmm-nopretrain", "plus-normm-fit", "plus-normm-fit-alone", "plus-normm",
@@ -38,9 +36,8 @@ def compare_all(experiments: Sequence[Experiment]) -> list[Section]:
     sections = []
     for scale in sorted({experiment.scale for experiment in experiments}):
         of_scale = [e for e in experiments if e.scale == scale]
-        baselines = [e for e in experiments if e.name in BASELINES]
-        named = {e.name: e for e in [*of_scale, *baselines]}
-        if len(named) > 1 and of_scale != baselines:
+        named = {e.name: e for e in of_scale}
+        if len(named) > 1:
             blocks = (
                 *_policies(named),
                 *_continued(named),

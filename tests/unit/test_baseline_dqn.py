@@ -14,6 +14,7 @@ from experiments import baseline_dqn
 from experiments.baseline_dqn import EVALUATIONS, DistanceReward, Plan, planned
 from experiments.choosers import Chooser, uniform
 from experiments.environment import CorridorEnv
+from experiments.plan import load_plan, stage_config
 from experiments.records import EVALUATION_COLUMNS, read_csv
 from experiments.runs import read_info
 from services.robot_driver.robot import Pose
@@ -57,16 +58,28 @@ def test_reports_can_read_what_was_run(tmp_path: Path) -> None:
     chosen = plan(tmp_path)
     baseline_dqn.run(chosen, Pretender())
     info = read_info(tmp_path / "run.json")
-    assert (info.experiment, info.actions, info.train_steps, info.seed) == ("dqn", 207, 51, 1)
+    assert (info.experiment, info.actions, info.train_steps, info.seed) == (
+        "dqn-progress", 207, 51, 1,
+    )  # fmt: skip
     assert info.complete
     assert "--actions 207" in json.loads((tmp_path / "run.json").read_text())["command"]
 
 
-def test_what_is_shared_with_ours_comes_from_the_command_line(tmp_path: Path) -> None:
-    words = "--world minus --seed 5 --filters 8 --memory 900 --threads 2 --reward distance --out x"
-    config = planned(words.split()).config
-    assert (config.robot.world, config.run.seed, config.network.filters) == ("minus", 5, 8)
-    assert (config.memory.capacity, config.numerics.learner.threads) == (900, 2)
+def test_what_is_shared_with_ours_comes_from_the_plan() -> None:
+    words = "--like plus-minus --scale mini --seed 5 --threads 2 --reward distance --out x"
+    made = planned(words.split())
+    ours = load_plan("plus-minus", "mini")
+    config, last = made.config, stage_config(ours, len(ours.stages) - 1, 5)
+    assert (config.network, config.robot, config.episode) == (
+        last.network, last.robot, last.episode,
+    )  # fmt: skip
+    assert (config.memory.capacity, config.run.seed) == (last.memory.capacity, 5)
+    assert (made.scale, made.factor, config.numerics.learner.threads) == ("mini", 20, 2)
+
+
+def test_an_unknown_plan_is_refused_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert baseline_dqn.main(["--like", "nothing", "--out", "x"]) == 2
+    assert "got 'nothing'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("words", ["", "--actions 0 --out x", "--reward fame --out x"])

@@ -106,19 +106,19 @@ def test_memories_that_did_not_begin_equal_are_told(tmp_path: Path) -> None:
     assert "The memories did not begin equal in seed 2." in sentences(section)
 
 
-def test_another_method_is_compared_at_every_scale(tmp_path: Path) -> None:
+def test_another_method_is_compared_at_its_scale(tmp_path: Path) -> None:
     for seed in (1, 2):
         write_run(tmp_path, "plus-rmm", seed)
         other = write_run(tmp_path / "other", "policy-roulette", seed)
         (other / "episodes.csv").unlink()
         info = json.loads((other / "run.json").read_text())
         left = {key: info[key] for key in info if key not in ("after", "prefill", "first_lap")}
-        left |= {"experiment": "dqn", "scale": "full", "factor": 1, "actions": 5000}
+        left |= {"experiment": "dqn-distance", "actions": 5000}
         (other / "run.json").write_text(json.dumps(left))
     found = load([tmp_path / "other", tmp_path / "plus-rmm-mini"])
     (section,) = compare_all(found)
     assert section.name == "comparisons-mini"
-    assert "plus-rmm had fewer bumps than dqn in plus" in sentences(section)
+    assert "plus-rmm had fewer bumps than dqn-distance in plus" in sentences(section)
     assert found[0].runs[0].actions == 5000  # there are no episodes to add up
 
 
