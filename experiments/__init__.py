@@ -5,7 +5,7 @@ Read `single_process` first. Then, each group resting on those before:
 learning    environment, single_process
 driving     places, choosers, traces, evaluation, routes, references, tour, frozen, evaluate
 running     plan (data in plans/), recorder, probes, observer, snapshot, runner, experiment
-telling     records, runs, measures, statistics, comparisons, findings, figures/, document, report,
-            results
+telling     records, runs, measures, statistics, comparisons, findings, tables, figures/, document,
+            report, results
 beside it   baseline_dqn, sb3
 """

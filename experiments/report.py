@@ -12,7 +12,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from experiments import findings, routes, runs
+from experiments import findings, routes, runs, tables
 from experiments.comparisons import compare_all
 from experiments.document import (
     Block,
@@ -247,6 +247,7 @@ def _evaluations(experiment: Experiment) -> list[Block]:
         drawn = partial(evaluation.curves, [experiment], world)
         blocks.append(_picture(experiment, f"evaluation-{world}", title, caption, drawn))
         blocks += _sentences(findings.evaluation(experiment, world))
+        blocks.append(tables.frozen(experiment, world))
     return blocks
 
 
