@@ -1,0 +1,1 @@
+"""Emulated robots: worlds behind the interfaces of real robots, faults included."""

@@ -1,0 +1,134 @@
+"""An emulated base in a simulated world, running by the wall clock in a thread of its own."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from services.robot_driver.emulation.dynamics import STEP_S, BaseDynamics, EmulatedBase, Given
+from services.robot_driver.robot import Pose, Velocity
+from services.robot_driver.sim import SimRobot
+from services.robot_driver.world import WorldError, load_world
+from shared.config import CameraConfig, RobotConfig
+from shared.errors import ConfigError
+
+NOISE = 2.0
+"""Standard deviation of the camera's noise, in grey values: no two pictures are equal."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What an emulated robot really does: for tests, not for drivers."""
+
+    now_s: float
+    """Monotonic clock of this computer, as all times here."""
+    pose: Pose
+    """In the world."""
+    velocity: Velocity
+    contact: bool
+    still_since_s: float | None
+    """None while it moves."""
+    watchdog_stops: int
+    commands: tuple[Given, ...]
+
+
+@dataclass(frozen=True)
+class Counted:
+    """What the base tells of itself."""
+
+    odometry: Pose
+    velocity: Velocity
+    sequence: int
+    contact: bool
+
+
+class EmulatedRobot:
+    """A base, its bumper and its camera. All methods may be called from any thread.
+
+    Args:
+        world: Name of the world, such as `plus`; it starts at the first start pose.
+        dynamics: How the base follows commands.
+        robot: Shape of the robot and its camera.
+
+    Raises:
+        ConfigError: There is no such world, or the robot does not fit into it.
+    """
+
+    def __init__(self, world: str, dynamics: BaseDynamics, robot: RobotConfig) -> None:
+        try:
+            self._body = SimRobot(robot, load_world(world), seed=0)
+        except (WorldError, ValueError) as error:
+            raise ConfigError(f"--world: {error}") from error
+        self._camera = robot.camera
+        self._lock = threading.Lock()
+        self._base = EmulatedBase(self._body, dynamics, time.monotonic())
+        self._noise = np.random.default_rng(0)
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="emulated-base", daemon=True)
+        self._thread.start()
+
+    def command(self, velocity: Velocity) -> None:
+        """A command arrives now. Raises ValueError unless it is finite."""
+        with self._lock:
+            self._base.command(velocity, time.monotonic())
+
+    def counted(self) -> Counted:
+        """Odometry, velocity, sequence number and bumper now."""
+        with self._lock:
+            base = self._base
+            return Counted(base.odometry, base.velocity, base.sequence, base.contact)
+
+    def truth(self) -> Truth:
+        """What the robot really does now."""
+        with self._lock:
+            base = self._base
+            base.run_until(time.monotonic())
+            return Truth(
+                now_s=base.now_s,
+                pose=self._body.pose,
+                velocity=base.velocity,
+                contact=base.contact,
+                still_since_s=base.still_since_s,
+                watchdog_stops=base.watchdog_stops,
+                commands=tuple(base.commands),
+            )
+
+    def configure(self, *, stalled: bool, watchdog_s: float) -> None:
+        """Let the motors stall or turn, and set the base's watchdog."""
+        with self._lock:
+            self._base.stalled = stalled
+            self._base.configure(watchdog_s=watchdog_s)
+
+    def picture(self) -> npt.NDArray[np.uint8]:
+        """What the camera sees now: uint8 [h, w, 3], RGB, with noise as of a real sensor."""
+        with self._lock:
+            frame = self._body.frame()
+            noise = self._noise.normal(0.0, NOISE, frame.shape[:2])
+        noisy = frame + np.rint(noise).astype(np.int16)[..., np.newaxis]
+        return np.asarray(np.clip(noisy, 0, 255), np.uint8)
+
+    def close(self) -> None:
+        """End the thread and free the world. May be called twice."""
+        self._done.set()
+        self._thread.join(5.0)
+        with self._lock:
+            self._body.close()
+
+    def _run(self) -> None:
+        while not self._done.wait(STEP_S):
+            with self._lock:
+                self._base.run_until(time.monotonic())
+
+
+def camera_of(vertical_fov_deg: float, aspect: float, width_px: int = 160) -> CameraConfig:
+    """A small camera to scale up from, of a given field of view."""
+    return CameraConfig(
+        vertical_fov_deg=vertical_fov_deg,
+        aspect=aspect,
+        render_width_px=width_px,
+        render_height_px=round(width_px / aspect),
+    )
