@@ -2,7 +2,7 @@
 
 A plan is a TOML file in `plans/`: a configuration (differences to the defaults only), stages that
 change parts of it while the run goes on, and the plan whose end it begins with. `full` has the
-exact constants; `mini` has the same shape, with episodes and memories divided by the plan's factor
+exact constants; `mini` has the same shape, with episodes and memories divided by the plan's factors
 (the counts of the memory follow, E17b) and a narrower network.
 """
 
@@ -22,14 +22,10 @@ from shared.settings import preset_tree
 Scale = Literal["full", "mini"]
 SCALES: tuple[Scale, ...] = ("full", "mini")
 Tree = dict[str, Any]
-DIVIDED = (
-    ("memory", "capacity"),
-    ("memory", "capacity_max"),
-    ("memory", "capacity_step"),
-    ("memory", "equalise_every"),
-    ("learning", "fit_every"),
-)
-"""What a smaller scale divides beside the episodes: sizes, and periods counted in episodes."""
+SIZES = (("memory", "capacity"), ("memory", "capacity_max"), ("memory", "capacity_step"))
+"""What a smaller scale divides by its `memory_factor`."""
+PERIODS = (("memory", "equalise_every"), ("learning", "fit_every"))
+"""What it divides by its `factor`: periods counted in episodes."""
 
 
 class Stage(Section):
@@ -51,7 +47,10 @@ class Mini(Section):
     """How the small scale differs."""
 
     factor: Annotated[int, Field(ge=1, le=1000)]
-    """Episodes, memories, and periods in episodes are divided by it."""
+    """Episodes, and periods in episodes, are divided by it."""
+    memory_factor: Annotated[int, Field(ge=0, le=1000)] = 0
+    """Memories are divided by it; 0: by `factor`. An episode is as long as ever, so a memory that
+    shrinks as much as the number of episodes holds the last few of them only."""
     mini_batches: Annotated[int, Field(ge=1, le=100)] = 1
     """Mini-batches after an episode are multiplied by it: a network needs its training steps,
     however small the memory."""
@@ -212,7 +211,7 @@ def _with_defaults(config: Tree) -> Tree:
     """With the values that a smaller scale divides, where the plan leaves them at the default."""
     defaults = Config().to_dict()
     tables: Tree = {"learning": {}, "memory": {}}
-    for section, key in (*DIVIDED, ("learning", "mini_batches_per_episode")):
+    for section, key in (*SIZES, *PERIODS, ("learning", "mini_batches_per_episode")):
         if key in defaults[section]:
             tables[section][key] = defaults[section][key]
     return merged(tables, config)
@@ -220,9 +219,11 @@ def _with_defaults(config: Tree) -> Tree:
 
 def _divided(config: Tree, mini: Mini) -> Tree:
     result = merged({}, config)
-    for section, key in DIVIDED:
+    by = dict.fromkeys(SIZES, mini.memory_factor or mini.factor)
+    by |= dict.fromkeys(PERIODS, mini.factor)
+    for (section, key), factor in by.items():
         if result.get(section, {}).get(key, 0) > 0:
-            value = max(1, result[section][key] // mini.factor)
+            value = max(1, result[section][key] // factor)
             result = merged(result, {section: {key: value}})
     batches = result.get("learning", {}).get("mini_batches_per_episode")
     if batches:

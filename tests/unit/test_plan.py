@@ -5,7 +5,9 @@ from __future__ import annotations
 import pytest
 
 from experiments.plan import SCALES, load_plan, merged, plan_names, read_plan, stage_config
+from services.robot_driver.world import load_world
 from shared.errors import ConfigError
+from shared.messages import WorldChange
 
 SMALL = """
 title = "t"
@@ -119,6 +121,8 @@ def test_mini_divides_sizes_and_periods_and_nothing_else() -> None:
     assert first.learning.mini_batches_per_episode == 3  # of 1, the default
     assert second.learning.mini_batches_per_episode == 6
     assert second.memory.capacity == 40  # kept from the stage before
+    text = SMALL.replace("factor = 10", "factor = 10\nmemory_factor = 4")
+    assert stage_config(read_plan("small", text, "mini"), 0, 1).memory.capacity == 100
     full = stage_config(read_plan("small", SMALL, "full"), 1, 1)
     assert full.learning.mini_batches_per_episode == 2
     assert full.network.filters == 64
@@ -177,4 +181,19 @@ def test_i16c_lets_the_memory_grow_and_marks_what_was_there_before() -> None:
     kinds = [change["kind"] for change in plan.stages[0].changes]
     assert {"place", "remove"} <= set(kinds)
     mini = stage_config(load_plan("i16c", "mini"), 0, 1).memory
-    assert (mini.capacity, mini.capacity_max, mini.capacity_step) == (2500, 4500, 250)
+    assert (mini.capacity, mini.capacity_max, mini.capacity_step) == (10000, 18000, 1000)
+
+
+@pytest.mark.parametrize("name", plan_names())
+def test_obstacles_of_a_schedule_are_there_when_removed_and_not_when_placed(name: str) -> None:
+    plan = load_plan(name, "full")
+    for index, stage in enumerate(plan.stages):
+        world = load_world(stage_config(plan, index, 1).robot.world)
+        there = {obstacle.name for obstacle in world.obstacles}
+        for tree in sorted(stage.changes, key=lambda change: change["at_episode"]):
+            change = WorldChange.model_validate(tree)
+            if change.box is not None:
+                assert change.box.name not in there
+                there.add(change.box.name)
+            else:
+                there.remove(str(change.name))
