@@ -83,6 +83,7 @@ class Plan:
     config: Config
     scale: Scale
     factor: int
+    memory_factor: int
     actions: int
     reward: str
     starts: int
@@ -198,6 +199,7 @@ def _told(plan: Plan, learner: Learner, seconds: float, began: str) -> bytes:
         "title": f"DQN of Stable-Baselines3, reward {plan.reward}",
         "scale": plan.scale,
         "factor": plan.factor,
+        "memory_factor": plan.memory_factor,
         "seed": plan.config.run.seed,
         "command": plan.command,
         "commit": made["commit"],
@@ -262,8 +264,9 @@ def planned(words: Sequence[str]) -> Plan:
         }
     )
     command = shlex.join(["python", "-m", "experiments.baseline_dqn", *words])
+    factors = (like.mini.factor, like.mini.memories_by) if given.scale == "mini" else (1, 1)
     return Plan(
-        config, given.scale, like.mini.factor if given.scale == "mini" else 1, given.actions,
+        config, given.scale, *factors, given.actions,
         given.reward, given.starts, given.drive_actions, given.out, command,
     )  # fmt: skip
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from experiments.figures.evaluation import Compared, laps
 from experiments.figures.progress import curve_of
-from experiments.runs import Experiment, Floats, Rows, Run
+from experiments.runs import Experiment, Floats, Rows, Run, RunInfo
 from experiments.statistics import bootstrap_difference
 from shared.rl.draws import generator
 
@@ -24,8 +25,13 @@ class Measure:
 
     text: str
     of: Callable[[Run], float]
-    scales: bool
-    """Whether it grows with the number of episodes or samples of a run."""
+    scales: Literal["", "episodes", "memory"] = ""
+    """What it grows with: the number of episodes, or the size of the memory."""
+
+    def scaled(self, value: float, info: RunInfo) -> float:
+        """A number of the thesis at the scale of a run."""
+        by = {"": 1.0, "episodes": info.factor, "memory": info.memory_factor}
+        return value / by[self.scales]
 
 
 def _highest(run: Run, column: str) -> float:
@@ -55,19 +61,19 @@ def actions_per_episode(run: Run) -> float:
 
 
 MEASURED = {
-    "episodes": Measure("episodes", lambda run: float(len(run.episodes)), scales=True),
-    "actions": Measure("actions", lambda run: float(run.actions), scales=True),
-    "actions_per_episode": Measure("actions per episode", actions_per_episode, scales=False),
+    "episodes": Measure("episodes", lambda run: float(len(run.episodes)), "episodes"),
+    "actions": Measure("actions", lambda run: float(run.actions), "episodes"),
+    "actions_per_episode": Measure("actions per episode", actions_per_episode),
     "capacity": Measure(
-        "largest capacity of the memory", lambda run: _highest(run, "capacity"), scales=True
+        "largest capacity of the memory", lambda run: _highest(run, "capacity"), "memory"
     ),
-    "longest_run": Measure("most actions without a bump", longest_run, scales=True),
+    "longest_run": Measure("most actions without a bump", longest_run, "episodes"),
     "longest_run_episode": Measure(
-        "episode of the longest way without a bump", longest_run_episode, scales=True
+        "episode of the longest way without a bump", longest_run_episode, "episodes"
     ),
-    "fitness": Measure("highest mean fitness", max_mean_fitness, scales=False),
+    "fitness": Measure("highest mean fitness", max_mean_fitness),
     "max_threshold_percent": Measure(
-        "highest threshold (%)", lambda run: _highest(run, "threshold_percent"), scales=False
+        "highest threshold (%)", lambda run: _highest(run, "threshold_percent")
     ),
 }
 """What stands in `thesis` of run.json under these names is shown beside ours (E37)."""

@@ -56,6 +56,11 @@ class Mini(Section):
     however small the memory."""
     config: Tree = Field(default_factory=dict)
 
+    @property
+    def memories_by(self) -> int:
+        """What memories are divided by."""
+        return self.memory_factor or self.factor
+
 
 class Evaluation(Section):
     """Frozen drives during a run."""
@@ -219,7 +224,7 @@ def _with_defaults(config: Tree) -> Tree:
 
 def _divided(config: Tree, mini: Mini) -> Tree:
     result = merged({}, config)
-    by = dict.fromkeys(SIZES, mini.memory_factor or mini.factor)
+    by = dict.fromkeys(SIZES, mini.memories_by)
     by |= dict.fromkeys(PERIODS, mini.factor)
     for (section, key), factor in by.items():
         if result.get(section, {}).get(key, 0) > 0:

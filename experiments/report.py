@@ -173,7 +173,7 @@ def _seeds_text(experiment: Experiment) -> str:
 
 
 def _beside_thesis(experiment: Experiment) -> list[Block]:
-    thesis, factor = experiment.first.thesis, experiment.first.factor
+    first, thesis = experiment.first, experiment.first.thesis
     if not thesis:
         return [Missing("the thesis's numbers", "the thesis tells none for this experiment")]
     rows = []
@@ -182,9 +182,10 @@ def _beside_thesis(experiment: Experiment) -> list[Block]:
         if measure is None or not isinstance(value, int | float):
             rows.append((name.replace("_", " "), str(value), "-", "not measured"))
             continue
-        scaled = number(value / factor) if measure.scales else number(value)
+        scaled = number(measure.scaled(value, first))
         rows.append((measure.text, number(value), scaled, spread(of_seeds(experiment, measure.of))))
-    header = ("", "thesis", f"thesis at this scale (1/{factor:g})", "ours")
+    scale = f"thesis at this scale (episodes 1/{first.factor:g}, memory 1/{first.memory_factor:g})"
+    header = ("", "thesis", scale, "ours")
     title = "Beside the thesis, whose numbers are those of single runs: shapes count, not digits"
     return [Table(title, header, tuple(rows))]
 

@@ -358,6 +358,7 @@ class Run:
             "source": plan.source,
             "scale": self._scale,
             "factor": plan.mini.factor if self._scale == "mini" else 1,
+            "memory_factor": plan.mini.memories_by if self._scale == "mini" else 1,
             "seed": self.seed,
             "after": plan.after,
             "command": self._command,

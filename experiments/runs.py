@@ -62,7 +62,9 @@ class RunInfo(_Record):
     title: str
     scale: str
     factor: float = Field(gt=0.0)
-    """How many times fewer episodes and samples than in the thesis; 1 at full scale."""
+    """How many times fewer episodes than in the thesis; 1 at full scale."""
+    memory_factor: float = Field(default=1.0, gt=0.0)
+    """How many times smaller memories are."""
     seed: int
     after: str = ""
     """The experiment whose end this one began with; empty for none."""

@@ -199,7 +199,7 @@ def _info(experiment: str, shape: Shape, seed: int, episodes: list[Row]) -> dict
         first += count
     return {
         "experiment": experiment, "title": experiment.replace("-", " ").capitalize(),
-        "scale": "mini", "factor": FACTOR, "seed": seed,
+        "scale": "mini", "factor": FACTOR, "memory_factor": FACTOR, "seed": seed,
         "command": f"experiment {experiment} --seed {seed}", "commit": "0123abc",
         "machine": "2 cores, AMD EPYC", "python": "3.11.9", "torch": "2.13.0",
         "started": "2026-01-01T00:00:00Z", "finished": "2026-01-01T01:00:00Z",
