@@ -83,6 +83,8 @@ class HardwareConfig(Section):
     """The robot stands still while its newest odometry is older."""
     bumper_stale_s: float = Field(default=0.5, gt=0.0, le=5.0)
     """The robot stands still while its newest bumper reading is older: silence is no all-clear."""
+    rest_s: float = Field(default=0.7, ge=0.0, le=5.0)
+    """After a recovery: until a robot that was told to stop stands still, its delay included."""
     open_timeout_s: float = Field(default=10.0, gt=0.0, le=120.0)
     """The service ends when robot and sensors have not all answered by then."""
 
@@ -176,6 +178,10 @@ class RobotConfig(Section):
         if self.kind != "sim" and self.timing != "realtime":
             raise ValueError(
                 f"robot.kind '{self.kind}' needs robot.timing 'realtime', got '{self.timing}'"
+            )
+        if self.kind != "sim" and self.recovery != "back-off":
+            raise ValueError(
+                f"robot.kind '{self.kind}' needs robot.recovery 'back-off', got '{self.recovery}'"
             )
         if self.deadman_s < self.period_s:
             raise ValueError(
@@ -368,6 +374,10 @@ class NumericsConfig(Section):
     learner: LearnerNumerics = LearnerNumerics()
 
 
+DRIVER_ONLY = ("id", "kind", "hardware", "robotino", "ros2")
+"""Keys of `robot` that nobody but its driver uses: another robot may take part in a run."""
+
+
 class Config(Section):
     """The whole tree."""
 
@@ -404,9 +414,12 @@ class Config(Section):
     def fingerprint(self) -> str:
         """16 hex digits over everything that must agree between services that work together.
 
-        Where the router is, how long the run goes on, and which robot a driver drives may differ.
+        Where the router is, how long the run goes on, which robot a driver drives and how it
+        reaches it may differ.
         """
         tree = self.to_dict()
-        del tree["bus"], tree["run"]["episodes"], tree["robot"]["id"]
+        del tree["bus"], tree["run"]["episodes"]
+        for key in DRIVER_ONLY:
+            del tree["robot"][key]
         text = json.dumps(tree, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -3,6 +3,7 @@
 CorridorError
 ├── ConfigError        wrong configuration or folder: exit code 2, one line, nothing moved yet
 ├── StateError         what lies on disk does not fit or is damaged: exit code 3
+├── RobotMissing       no real robot answers (yet): exit code 1, one line
 ├── BadMessage         bytes that are not a valid message of the expected type
 └── BusError
     ├── RouterMissing  no router at the endpoint (yet)
@@ -22,6 +23,10 @@ class ConfigError(CorridorError):
 
 class StateError(CorridorError):
     """State on disk that does not belong to this run or is damaged."""
+
+
+class RobotMissing(CorridorError):
+    """The real robot cannot be reached, or one of its sensors does not answer."""
 
 
 class BadMessage(CorridorError):

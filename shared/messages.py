@@ -33,8 +33,13 @@ Channel = Annotated[int, Field(ge=0, le=255)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
 
-Interruption = Literal["", "pause", "estop", "late", "stop", "restart", "world"]
-"""Why the robot did not simply execute the last action; empty: it did."""
+MAX_FAULTS = 24
+"""Kinds of faults that a driver tells of: the most frequent ones."""
+FaultName = Annotated[str, Field(max_length=64)]
+
+Interruption = Literal["", "pause", "estop", "late", "stop", "restart", "world", "blocked"]
+"""Why the robot did not simply execute the last action; empty: it did. blocked: a real robot was
+not fit to drive, `RobotState.reason` said why."""
 
 
 class Message(BaseModel):
@@ -118,7 +123,8 @@ class RobotState(Message):
 
     robot: Ident
     life: Life
-    state: Literal["waiting", "driving", "recovering", "paused", "estop", "stopped"]
+    state: Literal["waiting", "driving", "recovering", "blocked", "paused", "estop", "stopped"]
+    """blocked: a real robot is not fit to drive; it goes on by itself once it is."""
     sequence: Count
     x_m: float
     y_m: float
@@ -138,6 +144,12 @@ class RobotState(Message):
     """Changes of the world that wait for their episode."""
     refused_changes: Count
     """Changes of the world that were refused, at once or when they were due."""
+    blocks: Count = 0
+    """How often the robot was found unfit to drive."""
+    reason: Annotated[str, Field(max_length=200)] = ""
+    """Why it is not fit to drive now; empty when it is."""
+    faults: Annotated[dict[FaultName, Count], Field(max_length=MAX_FAULTS)] = {}
+    """What went wrong between driver and robot so far, by what it was: `camera: timeout`."""
 
 
 class Box(Message):

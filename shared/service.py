@@ -17,7 +17,14 @@ from typing import TypeVar
 
 from shared.bus import Bus, Inbox
 from shared.config import Config
-from shared.errors import BusError, ConfigError, CorridorError, RouterMissing, StateError
+from shared.errors import (
+    BusError,
+    ConfigError,
+    CorridorError,
+    RobotMissing,
+    RouterMissing,
+    StateError,
+)
 from shared.keys import SERVICE
 from shared.messages import PROTOCOL_VERSION, ServiceCommand, ServiceReply
 
@@ -222,6 +229,9 @@ def guarded(name: str, main: Callable[[], None]) -> int:
     except (ConfigError, StateError) as error:
         log.error("%s", error)
         return EXIT_CONFIG if isinstance(error, ConfigError) else EXIT_STATE
+    except RobotMissing as error:
+        log.error("%s", error)
+        return EXIT_CRASH
     except CorridorError:
         log.exception("%s failed", name)
         return EXIT_CRASH

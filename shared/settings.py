@@ -21,7 +21,7 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
-from shared.config import Config, Section
+from shared.config import DRIVER_ONLY, Config, Section
 from shared.errors import ConfigError, StateError
 
 ENV_PREFIX = "CORRIDOR_"
@@ -135,8 +135,8 @@ def claim(folder: Path, config: Config) -> Config:
     """Take the run folder for this configuration; returns the one stored in it.
 
     The first use creates the folder and its `config.toml`, which then never changes. Only what
-    `Config.fingerprint` leaves out (where the router is, how long the run goes on, the robot's
-    id) may differ on later uses.
+    `Config.fingerprint` leaves out (where the router is, how long the run goes on, which robot
+    drives and how it is reached) may differ on later uses.
 
     Raises:
         ConfigError: the folder belongs to another configuration, or cannot be made.
@@ -200,7 +200,9 @@ def _first_binding_difference(stored: Config, config: Config) -> tuple[str, Any,
 
 def _binds(key: str) -> bool:
     """Whether a setting is part of the fingerprint."""
-    return not (key.startswith("bus.") or key in {"run.episodes", "robot.id"})
+    section, _, rest = key.partition(".")
+    driver_only = section == "robot" and rest.partition(".")[0] in DRIVER_ONLY
+    return not (section == "bus" or key == "run.episodes" or driver_only)
 
 
 class _Merged:

@@ -12,10 +12,11 @@ from typing import Any, Literal
 
 from services.robot_driver.changes import Changes, Outcome, described
 from services.robot_driver.recovery import Halted, WatchedRobot, back_off
-from services.robot_driver.robot import STANDSTILL, Pose, Robot, Velocity
+from services.robot_driver.robot import STANDSTILL, NotReady, Pose, Robot, Velocity
 from services.robot_driver.safety import Safety
 from shared.config import Config
 from shared.messages import (
+    MAX_FAULTS,
     Action,
     Interruption,
     Observation,
@@ -26,7 +27,7 @@ from shared.messages import (
 from shared.rl.draws import generator
 from shared.rl.policy import FORWARD_LEFT, FORWARD_RIGHT
 
-State = Literal["waiting", "driving", "recovering", "paused", "estop", "stopped"]
+State = Literal["waiting", "driving", "recovering", "blocked", "paused", "estop", "stopped"]
 SLICE_S = 0.02
 """Realtime: how often commands, bumper and deadman are looked at within a period."""
 
@@ -54,7 +55,9 @@ class Driver:
         self.sequence = 0
         self.attempt = 0
         self.bumps = self.recoveries = self.late_actions = self.refused_actions = 0
-        self.resent_observations = self.refused_changes = 0
+        self.resent_observations = self.refused_changes = self.blocks = 0
+        self.reason = ""
+        """Why the robot is not fit to drive; empty when it is."""
         self._changes = Changes(robot)
         self._bump = False
         self._interruption: Interruption = ""
@@ -156,6 +159,23 @@ class Driver:
         self._interruption = interruption or self._interruption
         self.state = "waiting"
 
+    def block(self, reason: str) -> None:
+        """The robot is not fit to drive: stand still until `fit`, then look anew."""
+        self.halt()
+        self.blocks += 1
+        self.look_again("blocked")
+        self.state, self.reason = "blocked", reason
+
+    def fit(self) -> bool:
+        """Whether the robot can be driven (again); if not, `reason` says why. Raises RobotFault."""
+        try:
+            self._robot.sense()
+        except NotReady as problem:
+            self.reason = str(problem)
+            return False
+        self.state, self.reason = "waiting", ""
+        return True
+
     def halt(self) -> None:
         """Stand still now; may be called in any state."""
         self._drive(STANDSTILL)
@@ -231,15 +251,19 @@ class Driver:
             laps_right=right,
             pending_changes=len(self._changes.pending),
             refused_changes=self.refused_changes,
+            blocks=self.blocks,
+            reason=self.reason[:200],
+            faults=self._faults(),
         )
 
     def saved(self) -> dict[str, Any]:
         """Everything a later process needs to continue exactly here, for msgpack."""
         names = (
             "life sequence attempt bumps recoveries late_actions refused_actions "
-            "resent_observations refused_changes _bump _interruption"
+            "resent_observations refused_changes blocks _bump _interruption"
         )
         return {
+            "kind": self._config.robot.kind,
             "robot": self._robot.state(),
             "changes": self._changes.saved(),
             "estop": self.safety.estop,
@@ -247,15 +271,20 @@ class Driver:
         }
 
     def restore(self, saved: dict[str, Any]) -> None:
-        """Continue from `saved()`. Raises KeyError or ValueError when it does not fit."""
+        """Continue from `saved()`. Raises KeyError or ValueError when it does not fit.
+
+        A real robot was not held still meanwhile: what it perceives next tells of a restart.
+        """
         if saved.keys() != self.saved().keys():
             odd = sorted(saved.keys() ^ self.saved().keys())
             raise KeyError(f"missing or unknown: {', '.join(odd)}")
         self._changes.restore(saved["changes"])
         self._robot.restore(saved["robot"])
         self.safety.estop = bool(saved["estop"])
-        for name in saved.keys() - {"robot", "changes", "estop"}:
+        for name in saved.keys() - {"kind", "robot", "changes", "estop"}:
             setattr(self, name, type(getattr(self, name))(saved[name]))
+        if self._config.robot.kind != "sim":
+            self.look_again("restart")
 
     def restore_kept(self, kept: dict[str, Any]) -> None:
         """Begin anew in the world that an earlier, killed driver gave to `keep`.
@@ -291,6 +320,10 @@ class Driver:
         laps = getattr(self._robot, "laps", None)  # only worlds that know have them
         return (laps.left, laps.right) if laps else (0, 0)
 
+    def _faults(self) -> dict[str, int]:
+        faults = getattr(self._robot, "faults", None)  # only real robots have them
+        return {name[:64]: n for name, n in faults.most_common(MAX_FAULTS)} if faults else {}
+
     def _drive(self, velocity: Velocity) -> None:
         self._robot.drive(velocity)
         self._moving = velocity.moving
@@ -304,7 +337,11 @@ class Driver:
         )
         try:
             back_off(robot, self._config.robot, float(draw.uniform(-math.pi, math.pi)))
+            if self._config.robot.kind != "sim":  # it still moves when told to stop
+                robot.run(self._config.robot.hardware.rest_s, stop_on_contact=False)
             self.recoveries += 1
         except Halted:  # it stands where it was stopped; the operator's `clear` tells the actor
             pass
+        except NotReady:  # it stands; the next look tells why, and the actor
+            self.halt()
         self._moving = False

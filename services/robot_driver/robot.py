@@ -88,3 +88,10 @@ class Robot(Protocol):
 
 class RobotFault(Exception):
     """The robot cannot be read or commanded: stand still, report, let the service end."""
+
+
+class NotReady(RobotFault):
+    """The robot must stand still for now: a sensor is stale, its battery low, its bumper stuck.
+
+    The text says why. Once that is over the robot can go on.
+    """

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import time
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from services.robot_driver.driver import SLICE_S, Driver
-from services.robot_driver.robot import Robot
+from services.robot_driver.robot import NotReady, Robot, RobotFault
 from shared import statefile
 from shared.bus import Inbox
 from shared.config import Config
-from shared.errors import ConfigError, StateError
+from shared.errors import ConfigError, RobotMissing, StateError
 from shared.keys import ACTION, OBSERVATION, ROBOT_COMMAND, ROBOT_STATE, ROBOT_WORLD
 from shared.messages import Action, Observation, RobotCommand, WorldChange
 from shared.service import TICK_S, Service, Stopped, new_life, service
@@ -26,8 +27,42 @@ STATE, WORLD = "state.msgpack", "world.msgpack"
 """Files of a robot: all of a driver that was stopped; its world, also of one that was killed."""
 
 
+LINKS = {"robotino": "RobotinoLink", "ros2": "Ros2Link"}
+"""Kinds of real robots: a module of this package and a class in it."""
+
+
 def make_robot(config: Config) -> Robot:
-    """The robot of this configuration. Raises ConfigError for a world that cannot be used."""
+    """The robot of this configuration, simulated or real, ready to drive.
+
+    Raises:
+        ConfigError: A world that cannot be used, or a library that is not installed.
+        RobotMissing: The real robot does not answer.
+    """
+    kind = config.robot.kind
+    try:
+        return _simulated(config) if kind == "sim" else _real(config)
+    except ModuleNotFoundError as error:
+        if (error.name or "").split(".")[0] in {"services", "shared"}:
+            raise
+        raise ConfigError(
+            f"driver: robot.kind {kind!r} needs the Python package {error.name}, which is not "
+            f"installed: pip install 'corridor[{kind}]'"
+        ) from error
+
+
+def _real(config: Config) -> Robot:
+    from services.robot_driver.hardware import HardwareRobot
+
+    kind = config.robot.kind
+    module = importlib.import_module(f"services.robot_driver.{kind}")
+    link = getattr(module, LINKS[kind])(config)
+    try:
+        return HardwareRobot(config.robot, link)
+    except RobotFault as error:
+        raise RobotMissing(f"driver: {error}") from error
+
+
+def _simulated(config: Config) -> Robot:
     from services.robot_driver.sim import SimRobot
     from services.robot_driver.world import WorldError, load_world
 
@@ -45,7 +80,7 @@ def run(config: Config, folder: Path) -> None:
     robot = make_robot(config)
     driver = Driver(config, robot, new_life())
     try:
-        _restore(driver, own)
+        _restore(driver, own, config.robot.kind)
         driver.keep = functools.partial(statefile.save, own / WORLD)
         # Stopped before it was up, it has driven nothing, but has taken up what was saved.
         with suppress(Stopped), service("driver", config.robot.id, config, life=driver.life) as me:
@@ -62,15 +97,17 @@ def run(config: Config, folder: Path) -> None:
         robot.close()
 
 
-def _restore(driver: Driver, own: Path) -> None:
+def _restore(driver: Driver, own: Path, kind: str) -> None:
     """Continue after a clean stop; after a kill begin anew, but in the world as it was."""
     path = own / STATE
     try:
         if (saved := statefile.take(path)) is not None:
-            driver.restore(saved)
-            return
+            if saved["kind"] == kind:
+                driver.restore(saved)
+                return
+            driver.safety.estop = bool(saved["estop"])  # the rest is another robot's
         path = own / WORLD
-        if (kept := statefile.read(path)) is not None:
+        if kind == "sim" and (kept := statefile.read(path)) is not None:
             driver.restore_kept(kept)
     except (KeyError, TypeError, ValueError) as error:
         raise StateError(f"{path}: saved state of the robot does not fit: {error}") from error
@@ -161,6 +198,28 @@ class DriverLoop:
     # ------------------------------------------------------------ real time
 
     def _realtime_turn(self) -> None:
+        """One control period, or a stand until the robot is fit to drive."""
+        try:
+            self._control_period()
+        except NotReady as problem:
+            self._driver.block(str(problem))
+            self._stand_by()
+
+    def _stand_by(self) -> None:
+        """Stand still, answering commands, until the robot is fit to drive again."""
+        driver, told = self._driver, ""
+        while not self._me.stop.is_set():
+            if driver.reason != told:
+                told = driver.reason
+                self._me.log.warning("stands still: %s", told)
+                self.beat(force=True)
+            self._inbox.wait(SLICE_S)
+            self.beat()
+            if driver.fit():
+                self._me.log.info("fit to drive again")
+                return
+
+    def _control_period(self) -> None:
         """One control period: the robot goes on as it does until the answer comes.
 
         An answer counts until the period is over; without one the robot stops and the next
