@@ -1,0 +1,332 @@
+"""A Robotino's REST interface in front of an emulated base: `corridor emulate robotino`.
+
+Beside the robot's own paths there are two for tests, which no fault reaches: `/emulator/faults`
+(GET, POST) and `/emulator/truth` (GET).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import socket
+import struct
+import threading
+import time
+from dataclasses import asdict
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any, ClassVar
+from urllib.parse import urlsplit
+
+import cv2
+import numpy as np
+
+from services.robot_driver.emulation.dynamics import ROBOTINO, STEP_S
+from services.robot_driver.emulation.faults import Faults
+from services.robot_driver.emulation.world import EmulatedRobot, Truth, camera_of
+from services.robot_driver.robot import Velocity
+from shared.config import RobotConfig
+from shared.errors import ConfigError
+
+WIDTH, HEIGHT = 800, 600
+QUALITY = 80
+VERTICAL_FOV_DEG = 43.0
+COLD_S = 10.0
+"""Without a request for this long the camera is let go: the next one finds none."""
+MAX_BODY = 4096
+SPEED_LIMIT_M_S, TURN_LIMIT_RAD_S = 2.0, 3.0
+"""Beyond these the server refuses a command."""
+FREE_M = 0.41
+"""What distance sensors tell with nothing near; these ones never see anything."""
+Reply = tuple[int, str, bytes]
+_EMPTY: Reply = (HTTPStatus.OK, "application/json", b"")
+
+
+class EmulatedRobotino:
+    """The robot's paths, without a socket: a path in, status, type and body out."""
+
+    def __init__(self, world: str, faults: Faults) -> None:
+        shape = RobotConfig()
+        camera = camera_of(VERTICAL_FOV_DEG, WIDTH / HEIGHT)
+        self.robot = EmulatedRobot(world, ROBOTINO, shape.model_copy(update={"camera": camera}))
+        self._lock = threading.Lock()
+        self._faults = faults
+        self._frozen: dict[str, bytes] = {}
+        self._asked_s = -math.inf
+        self._apply(faults)
+
+    @property
+    def faults(self) -> Faults:
+        """What is wrong now."""
+        return self._faults
+
+    def change(self, body: bytes) -> Faults:
+        """Change faults by a JSON object. Raises ValueError."""
+        with self._lock:
+            self._faults = self._faults.changed(json.loads(body))
+            self._frozen.clear()
+            self._apply(self._faults)
+            return self._faults
+
+    def get(self, path: str) -> Reply:
+        """Answer a GET."""
+        faults = self._faults
+        if path == "/cam0":
+            return self._camera(faults)
+        if path == "/data/bumper":
+            return self._bumper(faults)
+        if path == "/data/odometry":
+            return self._odometry(faults)
+        if path == "/data/powermanagement":
+            return _json(
+                {
+                    "batteryLow": faults.battery_low,
+                    "batteryLowShutdownCounter": 60 if faults.battery_low else 0,
+                    "batteryType": "Li-Ion",
+                    "ext_power": False,
+                    "num_chargers": 0,
+                    "voltage": 15.9 if faults.battery_low else 19.2,
+                }
+            )
+        if path == "/data/distancesensorarray":
+            return _json([FREE_M] * 9)
+        if path in {"/data/scan0", "/data/festoolcharger"}:
+            return _EMPTY  # not fitted
+        return HTTPStatus.NOT_FOUND, "text/plain", b"not found"
+
+    def drive(self, method: str, body: bytes) -> Reply:
+        """Answer a PUT or POST of a velocity."""
+        faults = self._faults
+        if faults.commands == "refused":
+            return HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", b"busy"
+        try:
+            velocity = _velocity(json.loads(body))
+        except (ValueError, RecursionError) as error:
+            return HTTPStatus.BAD_REQUEST, "text/plain", str(error).encode()
+        if method == "PUT" or not faults.post_ignored:
+            self.robot.command(velocity)
+        return _EMPTY
+
+    def truth(self) -> dict[str, Any]:
+        """What the robot really does, ready for JSON."""
+        return truth_tree(self.robot.truth())
+
+    def _camera(self, faults: Faults) -> Reply:
+        now_s = time.monotonic()
+        with self._lock:
+            cold = now_s - self._asked_s > COLD_S
+            self._asked_s = now_s
+        if cold or faults.camera == "500":
+            return HTTPStatus.INTERNAL_SERVER_ERROR, "text/plain", b"No jpeg image available"
+        if faults.camera == "empty":
+            return HTTPStatus.OK, "image/jpeg", b""
+        picture = self._kept("camera") if faults.camera == "frozen" else None
+        if picture is None:
+            picture = jpeg(self.robot)
+            self._keep("camera", picture)
+        if faults.camera == "truncated":
+            picture = picture[: len(picture) // 2]
+        return HTTPStatus.OK, "image/jpeg", picture
+
+    def _bumper(self, faults: Faults) -> Reply:
+        if faults.bumper == "unreadable":
+            return HTTPStatus.INTERNAL_SERVER_ERROR, "text/plain", b"no bumper"
+        if faults.bumper == "nonsense":
+            return _json({"values": 1})
+        return _json({"value": faults.bumper == "stuck" or self.robot.counted().contact})
+
+    def _odometry(self, faults: Faults) -> Reply:
+        if faults.odometry == "empty":
+            return _EMPTY
+        body = self._kept("odometry") if faults.odometry == "frozen" else None
+        if body is None:
+            now = self.robot.counted()
+            values = (
+                *(now.odometry.x_m, now.odometry.y_m, now.odometry.heading_rad),
+                *(now.velocity.forward_m_s, now.velocity.left_m_s, now.velocity.turn_rad_s),
+            )
+            body = json.dumps([*(_shortest(value) for value in values), now.sequence]).encode()
+            self._keep("odometry", body)
+        return HTTPStatus.OK, "application/json", body
+
+    def _kept(self, name: str) -> bytes | None:
+        with self._lock:
+            return self._frozen.get(name)
+
+    def _keep(self, name: str, body: bytes) -> None:
+        with self._lock:
+            self._frozen[name] = body
+
+    def _apply(self, faults: Faults) -> None:
+        stalled = faults.odometry == "stalled"
+        self.robot.configure(stalled=stalled, watchdog_s=faults.watchdog_s)
+
+
+class Handler(BaseHTTPRequestHandler):
+    """One connection, kept open as the robot's server does."""
+
+    protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True
+    wbufsize = -1
+    """Buffered: a reply leaves in one piece."""
+    timeout = 30.0
+    robotino: ClassVar[EmulatedRobotino]
+
+    def do_GET(self) -> None:
+        """Readings, and what tests ask."""
+        path = urlsplit(self.path).path
+        if path == "/emulator/truth":
+            self._reply(_json(self.robotino.truth()))
+        elif path == "/emulator/faults":
+            self._reply(_json(self.robotino.faults.model_dump()))
+        elif self._reachable():
+            self._reply(self.robotino.get(path))
+
+    def do_PUT(self) -> None:
+        """Commands."""
+        self._command()
+
+    def do_POST(self) -> None:
+        """Commands, and changes of faults."""
+        self._command()
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Keep quiet: forty requests a second."""
+
+    def _command(self) -> None:
+        path = urlsplit(self.path).path
+        length = self.headers.get("Content-Length", "0")
+        size = int(length) if length.isdecimal() else MAX_BODY + 1
+        if size > MAX_BODY:
+            self.close_connection = True
+            self._reply((HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "text/plain", b""))
+            return
+        body = self.rfile.read(size)
+        if path == "/emulator/faults":
+            self._reply(self._changed(body))
+        elif self._reachable():
+            if path == "/data/omnidrive":
+                self._reply(self.robotino.drive(self.command, body))
+            else:
+                self._reply((HTTPStatus.NOT_FOUND, "text/plain", b"not found"))
+
+    def _changed(self, body: bytes) -> Reply:
+        try:
+            return _json(self.robotino.change(body).model_dump())
+        except ValueError as error:
+            return HTTPStatus.BAD_REQUEST, "text/plain", str(error).encode()
+
+    def _reachable(self) -> bool:
+        """Whether the network lets this request through; waits where it is slow."""
+        faults = self.robotino.faults
+        if faults.stall_s:
+            time.sleep(faults.stall_s)
+        while self.robotino.faults.network == "silent":
+            time.sleep(STEP_S)
+        if not faults.network:
+            return True
+        self.close_connection = True
+        if faults.network == "reset":
+            linger = struct.pack("ii", 1, 0)
+            self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+        return False
+
+    def _reply(self, reply: Reply) -> None:
+        status, kind, body = reply
+        try:
+            self.send_response(status)
+            self.send_header("Content-Type", kind)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+        except OSError:  # the client did not wait for it
+            self.close_connection = True
+
+
+class RobotinoServer(ThreadingHTTPServer):
+    """Listens for HTTP in front of an emulated Robotino. Use as a context manager.
+
+    Raises:
+        ConfigError: It cannot listen there.
+    """
+
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, listen: str, robotino: EmulatedRobotino) -> None:
+        host, _, port = listen.rpartition(":")
+        if not host or not port.isdecimal() or int(port) > 65535:
+            raise ConfigError(f"--listen: expected host:port, got {listen!r}")
+        handler = type("BoundHandler", (Handler,), {"robotino": robotino})
+        try:
+            super().__init__((host, int(port)), handler)
+        except OSError as error:
+            raise ConfigError(f"--listen: cannot listen on {listen!r}: {error}") from error
+
+    @property
+    def address(self) -> str:
+        """host:port where it listens."""
+        host, port = self.server_address[:2]
+        return f"{host!s}:{port}"
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A connection that broke is the client's business."""
+
+
+def jpeg(robot: EmulatedRobot) -> bytes:
+    """The camera's picture as the robot's server sends it: rendered small, scaled up."""
+    large = cv2.resize(robot.picture(), (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR)
+    done, data = cv2.imencode(".jpg", large[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    assert done
+    return np.asarray(data).tobytes()
+
+
+def truth_tree(truth: Truth) -> dict[str, Any]:
+    """What an emulated robot really does, ready for JSON; times by the monotonic clock."""
+    return {
+        "now_s": truth.now_s,
+        "pose": asdict(truth.pose),
+        "velocity": asdict(truth.velocity),
+        "contact": truth.contact,
+        "still_since_s": truth.still_since_s,
+        "watchdog_stops": truth.watchdog_stops,
+        "commands": [{"at_s": g.at_s, **asdict(g.velocity)} for g in truth.commands],
+    }
+
+
+def _velocity(values: object) -> Velocity:
+    """The velocity in `[vx, vy, omega]`. Raises ValueError beyond what the server accepts."""
+    numbers = isinstance(values, list) and len(values) == 3
+    if not numbers or any(
+        isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value)
+        for value in values  # type: ignore[attr-defined]
+    ):
+        raise ValueError("expected an array of three numbers")
+    forward, left, turn = (float(value) for value in values)  # type: ignore[attr-defined]
+    if max(abs(forward), abs(left)) > SPEED_LIMIT_M_S or abs(turn) > TURN_LIMIT_RAD_S:
+        raise ValueError("velocity out of range")
+    return Velocity(forward, left, turn)
+
+
+def _shortest(value: float) -> float | int:
+    """Whole numbers as integers, as the robot writes them."""
+    return int(value) if value.is_integer() else value
+
+
+def _json(tree: object) -> Reply:
+    return HTTPStatus.OK, "application/json", json.dumps(tree).encode()
+
+
+def run(world: str, listen: str, faults: Faults, ready: Any) -> None:
+    """Be a Robotino until Ctrl-C or SIGTERM; `ready` is called with the address."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    robotino = EmulatedRobotino(world, faults)
+    try:
+        with RobotinoServer(listen, robotino) as server:
+            ready(server.address)
+            server.serve_forever(poll_interval=0.1)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        robotino.robot.close()
