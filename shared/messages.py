@@ -35,7 +35,6 @@ Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
 
 MAX_FAULTS = 24
 """Kinds of faults that a driver tells of: the most frequent ones."""
-FaultName = Annotated[str, Field(max_length=64)]
 
 Interruption = Literal["", "pause", "estop", "late", "stop", "restart", "world", "blocked"]
 """Why the robot did not simply execute the last action; empty: it did. blocked: a real robot was
@@ -118,6 +117,14 @@ class RobotCommand(Message):
     command: Literal["estop", "clear", "pause", "resume"]
 
 
+class Fault(Message):
+    """One kind of fault between a driver and its robot."""
+
+    name: str
+    """Which part failed and how: `camera: timeout`."""
+    count: Count
+
+
 class RobotState(Message):
     """Heartbeat of a driver and its answer to commands. Driver to anyone."""
 
@@ -146,10 +153,10 @@ class RobotState(Message):
     """Changes of the world that were refused, at once or when they were due."""
     blocks: Count = 0
     """How often the robot was found unfit to drive."""
-    reason: Annotated[str, Field(max_length=200)] = ""
+    reason: str = ""
     """Why it is not fit to drive now; empty when it is."""
-    faults: Annotated[dict[FaultName, Count], Field(max_length=MAX_FAULTS)] = {}
-    """What went wrong between driver and robot so far, by what it was: `camera: timeout`."""
+    faults: Annotated[tuple[Fault, ...], Field(max_length=MAX_FAULTS)] = ()
+    """What went wrong between driver and robot so far, the most frequent first."""
 
 
 class Box(Message):

@@ -109,6 +109,8 @@ def _robot_warnings(view: View) -> Iterator[str]:
             yield f"robot {name}: emergency stop, release it by `corridor clear`"
         elif seen.message.state == "paused":
             yield f"robot {name}: paused, let it go on by `corridor resume`"
+        if seen.message.reason:
+            yield f"robot {name}: stands still: {seen.message.reason}"
 
 
 def _child_warnings(view: View) -> Iterator[str]:

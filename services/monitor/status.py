@@ -131,7 +131,12 @@ def _facts(snapshot: Snapshot) -> list[tuple[str, str]]:
         text += f"laps {r.laps_left} left {r.laps_right} right"
         if r.pending_changes:
             text += f", changes of the world waiting {r.pending_changes}"
+        if r.reason:
+            text += f", stands still: {r.reason}"
         rows.append((f"robot {name}", text))
+        if r.faults:
+            faults = ", ".join(f"{fault.name} {fault.count}" for fault in r.faults)
+            rows.append((f"faults of {name}", faults))
     for name, actor in snapshot.actors.items():
         a = actor.message
         text = f"{a.phase}, {a.actions_per_s:.1f} steps per second, weights {a.weights_version}"

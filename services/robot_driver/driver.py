@@ -18,6 +18,7 @@ from shared.config import Config
 from shared.messages import (
     MAX_FAULTS,
     Action,
+    Fault,
     Interruption,
     Observation,
     RobotState,
@@ -320,9 +321,10 @@ class Driver:
         laps = getattr(self._robot, "laps", None)  # only worlds that know have them
         return (laps.left, laps.right) if laps else (0, 0)
 
-    def _faults(self) -> dict[str, int]:
+    def _faults(self) -> tuple[Fault, ...]:
         faults = getattr(self._robot, "faults", None)  # only real robots have them
-        return {name[:64]: n for name, n in faults.most_common(MAX_FAULTS)} if faults else {}
+        most = faults.most_common(MAX_FAULTS) if faults else ()
+        return tuple(Fault(name=name[:64], count=count) for name, count in most)
 
     def _drive(self, velocity: Velocity) -> None:
         self._robot.drive(velocity)
