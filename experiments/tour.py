@@ -25,12 +25,14 @@ from shared.messages import Box, Observation, WorldChange, image_array
 from shared.rl.draws import generator
 from shared.rl.policy import FORWARD_LEFT, choose
 
-DRIVEN = 300
-"""Actions of a full tour, turns on the spot not counted."""
+DRIVEN, MOST_DRIVEN = 300, 600
+"""Actions of a full tour at least, turns on the spot not counted, and of one that is given up."""
 ROUTE_SHARE, BRIDGES = 0.6, 2
 """Of the route's length, and how many bridges, a full tour comes along."""
 DROP_AFTER = 200
 """Driven actions after which the next junction counts as the last one."""
+BEYOND_BOX = 30
+"""Actions driven after the box was dropped, before a tour is over."""
 NEAR_M = 1.0
 """A place is passed within this distance."""
 BOX_AHEAD_M = 1.1
@@ -96,7 +98,7 @@ class _Log:
 
 
 def drive_tour(env: CorridorEnv, network: Predicts, pose: Pose, number: int) -> Tour:
-    """One test drive of `DRIVEN` actions from a pose, in a world with a route.
+    """One test drive from a pose, in a world with a route: until it is full, or given up.
 
     Args:
         env: Its obstacles stay as they were found: the box is taken away again.
@@ -112,15 +114,17 @@ def drive_tour(env: CorridorEnv, network: Predicts, pose: Pose, number: int) -> 
         raise ValueError(f"world {world.name!r} has no route")
     observation: Observation = env.reset(seed=number, options={"pose": pose})[1]["observation"]
     log = _Log([(pose.x_m, pose.y_m, pose.heading_rad)])
-    dropped = False
+    dropped, dropped_at = False, 0
     draw = generator(number, ROLE)
     left, turns = 0.0, 0
     turn_rad = env.config.robot.turn_rad_s * env.config.robot.period_s
     most_turns = round(MOST_TURNING_RAD / turn_rad)
-    while sum(log.driven) < DRIVEN and len(log.bumps) < 4 * DRIVEN:
+    while (driven := sum(log.driven)) < MOST_DRIVEN and len(log.bumps) < 4 * MOST_DRIVEN:
         _tell_passed(world, log)
-        if not dropped and sum(log.driven) >= DROP_AFTER and _at_junction(world, env.robot.pose):
-            dropped = _drop_box(env, log)
+        if dropped and driven >= max(DRIVEN, dropped_at + BEYOND_BOX) and _full(world, log):
+            break
+        if not dropped and driven >= DROP_AFTER and _at_junction(world, env.robot.pose):
+            dropped, dropped_at = _drop_box(env, log), driven
             observation = env.observe()
         values = network.all_values(image_array(observation.image)[None])[0]
         action, _ = choose(values, GREEDY, draw)
@@ -155,6 +159,21 @@ def route_share(world: World, places_m: npt.NDArray[np.float64], near_m: float =
     return float(np.mean(gaps <= near_m))
 
 
+def _full(world: World, log: _Log) -> bool:
+    """Whether the robot has come along enough of the route and over enough bridges."""
+    places_m = np.array(log.poses)[:, :2]
+    return len(_bridges(world, places_m)) >= BRIDGES and route_share(world, places_m) >= ROUTE_SHARE
+
+
+def _bridges(world: World, places_m: npt.NDArray[np.float64]) -> tuple[str, ...]:
+    assert world.route is not None
+    return tuple(
+        place.name
+        for place in world.route.places
+        if place.kind == "bridge" and _nearest_m(places_m, place.x_m, place.y_m) <= NEAR_M
+    )
+
+
 def _tour(env: CorridorEnv, log: _Log, dropped: bool) -> Tour:
     world, poses = env.robot.world, np.array(log.poses)
     way_m = np.hypot(*np.diff(poses[:, :2], axis=0).T)
@@ -168,25 +187,19 @@ def _tour(env: CorridorEnv, log: _Log, dropped: bool) -> Tour:
         laps_left=laps.left,
         laps_right=laps.right,
     )
-    assert world.route is not None
-    bridges = tuple(
-        place.name
-        for place in world.route.places
-        if place.kind == "bridge" and _nearest_m(poses, place.x_m, place.y_m) <= NEAR_M
-    )
     driven = sum(log.driven)
     return Tour(
         Route(trace, tuple(log.events)),
         driven,
         len(log.driven) - driven,
         route_share(world, poses[:, :2]),
-        bridges,
+        _bridges(world, poses[:, :2]),
         dropped,
     )
 
 
-def _nearest_m(poses: npt.NDArray[np.float64], x_m: float, y_m: float) -> float:
-    return float(np.hypot(poses[:, 0] - x_m, poses[:, 1] - y_m).min())
+def _nearest_m(places_m: npt.NDArray[np.float64], x_m: float, y_m: float) -> float:
+    return float(np.hypot(places_m[:, 0] - x_m, places_m[:, 1] - y_m).min())
 
 
 def _tell_passed(world: World, log: _Log) -> None:

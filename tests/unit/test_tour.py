@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experiments.environment import CorridorEnv
-from experiments.tour import BOX_NAME, DRIVEN, drive_tour, route_share
+from experiments.tour import BOX_NAME, MOST_DRIVEN, drive_tour, route_share
 from services.robot_driver.robot import Pose
 from services.robot_driver.world import load_world
 from shared.config import Config
@@ -61,7 +61,7 @@ def test_a_negative_prediction_turns_on_the_spot_in_one_direction_until_it_is_no
     places = tour.route.trace.places_m
     np.testing.assert_allclose(places[0], places[2])
     assert tour.turned == 2
-    assert tour.driven == DRIVEN
+    assert tour.driven == MOST_DRIVEN
 
 
 def test_a_robot_that_finds_no_way_out_drives_on_after_two_full_turns(env: CorridorEnv) -> None:
@@ -69,7 +69,7 @@ def test_a_robot_that_finds_no_way_out_drives_on_after_two_full_turns(env: Corri
     turn = np.rad2deg(env.config.robot.turn_rad_s * env.config.robot.period_s)
     per_drive = int(np.ceil(720.0 / turn))
     assert tour.turned == pytest.approx(per_drive * tour.driven, abs=per_drive)
-    assert len(tour.route.trace.bumps) == 4 * DRIVEN
+    assert len(tour.route.trace.bumps) == 4 * MOST_DRIVEN
     assert not tour.passed
 
 
