@@ -12,9 +12,9 @@ from collections.abc import Iterator
 import msgpack
 import pytest
 from cluster import free_port
-from real_robots import Rig
-from standin_actor import answer
 
+from benchmarks.robot_rig import PARTS, Rig
+from benchmarks.standin_actor import answer
 from services.robot_driver.emulation.dynamics import ROBOTINO
 from services.robot_driver.robot import Velocity
 from shared.codec import encode
@@ -242,9 +242,8 @@ def test_a_pause_keeps_everything(rig: Rig) -> None:
 
 
 def five_stops(rig: Rig, since_s: float) -> list[object]:
-    parts = ("forward_m_s", "left_m_s", "turn_rad_s")
     stops = [
-        c for c in rig.truth()["commands"] if c["at_s"] >= since_s and not any(c[p] for p in parts)
+        c for c in rig.truth()["commands"] if c["at_s"] >= since_s and not any(c[p] for p in PARTS)
     ]
     return stops if len(stops) >= 5 else []
 

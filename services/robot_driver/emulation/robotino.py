@@ -52,7 +52,8 @@ class EmulatedRobotino:
         self.robot = EmulatedRobot(world, ROBOTINO, shape.model_copy(update={"camera": camera}))
         self._lock = threading.Lock()
         self._faults = faults
-        self._frozen: dict[str, bytes] = {}
+        self._last: dict[str, bytes] = {}
+        """Answers that are repeated once they are frozen."""
         self._asked_s = -math.inf
         self._apply(faults)
 
@@ -65,7 +66,6 @@ class EmulatedRobotino:
         """Change faults by a JSON object. Raises ValueError."""
         with self._lock:
             self._faults = self._faults.changed(json.loads(body))
-            self._frozen.clear()
             self._apply(self._faults)
             return self._faults
 
@@ -152,11 +152,11 @@ class EmulatedRobotino:
 
     def _kept(self, name: str) -> bytes | None:
         with self._lock:
-            return self._frozen.get(name)
+            return self._last.get(name)
 
     def _keep(self, name: str, body: bytes) -> None:
         with self._lock:
-            self._frozen[name] = body
+            self._last[name] = body
 
     def _apply(self, faults: Faults) -> None:
         stalled = faults.odometry == "stalled"

@@ -1,6 +1,6 @@
 """A driver in front of an emulated robot, in real processes, with faults at will.
 
-Shared by the tests of the fault table and by `benchmarks/robot_reaction.py`.
+Shared by `benchmarks/robot_reaction.py` and the tests of the fault table.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import httpx
-from waiting import wait_until
 
+from experiments.provenance import ROOT
 from shared import settings
 from shared.bus import Bus
 from shared.config import Config
@@ -26,9 +26,21 @@ from shared.errors import BusError, RouterMissing
 from shared.keys import ROBOT_COMMAND, ROBOT_STATE
 from shared.messages import RobotCommand, RobotState
 
-TESTS = Path(__file__).parent
+T = TypeVar("T")
 LEFT = "1"
 PATIENCE_S = 90.0
+POLL_S = 0.02
+PARTS = ("forward_m_s", "left_m_s", "turn_rad_s")
+
+
+def wait_until(condition: Callable[[], T], what: str) -> T:
+    """The first true result of a condition. Raises AssertionError when none came in time."""
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not (result := condition()):
+        if time.monotonic() > deadline_s:
+            raise AssertionError(f"not within {PATIENCE_S} s: {what}")
+        time.sleep(POLL_S)
+    return result
 
 
 class Rig:
@@ -77,13 +89,14 @@ class Rig:
                 self._first_line(name, name, "--listen", self.config.bus.endpoint)
             elif name == "actor":
                 arguments = (self.config.bus.endpoint, self.config.run.name, LEFT)
-                self._spawn(name, [sys.executable, str(TESTS / "standin_actor.py"), *arguments])
+                script = "benchmarks.standin_actor"
+                self._spawn(name, [sys.executable, "-m", script, *arguments])
             else:
                 options = ("--config", str(self._file), "--run-dir", str(self.folder))
                 self._corridor(name, name, *options)
 
     def kill(self, name: str) -> float:
-        """kill -9; returns when."""
+        """SIGKILL; returns when."""
         now_s = time.monotonic()
         self._processes[name].kill()
         self._processes[name].wait(10)
@@ -127,6 +140,7 @@ class Rig:
                 stderr=errors,
                 text=True,
                 env=environment,
+                cwd=ROOT,
                 start_new_session=True,
             )
         return process
@@ -181,11 +195,10 @@ class Rig:
             return [
                 command["at_s"] - since_s
                 for command in self.truth()["commands"]
-                if command["at_s"] >= since_s
-                and not any(command[k] for k in ("forward_m_s", "left_m_s", "turn_rad_s"))
+                if command["at_s"] >= since_s and not any(command[part] for part in PARTS)
             ]
 
-        return wait_until(stops, PATIENCE_S, "a stop arrives")[0]
+        return float(self.wait(stops, "a stop arrives")[0])
 
     # ------------------------------------------------------------ the driver
 
@@ -193,7 +206,8 @@ class Rig:
     def bus(self) -> Bus:
         """A client of the router."""
         if self._bus is None:
-            self._bus = wait_until(self._connect, PATIENCE_S, "the router answers")
+            self._bus = wait_until(self._connect, "the router answers")
+            assert self._bus is not None
             self._inbox = self._bus.inbox()
             self._inbox.subscribe(ROBOT_STATE)
         return self._bus
@@ -224,12 +238,14 @@ class Rig:
             except BusError:
                 return None
 
-        return wait_until(asked, PATIENCE_S, f"{name} acknowledged")
+        state = wait_until(asked, f"{name} acknowledged")
+        assert state is not None
+        return state
 
     def wait(self, condition: Callable[[], Any], what: str) -> Any:
         """Wait with a deadline, and show what was known when it passes."""
         try:
-            return wait_until(condition, PATIENCE_S, what)
+            return wait_until(condition, what)
         except AssertionError as error:
             logs = "\n".join(f"--- {name}\n{self.log(name)}" for name in self._processes)
             raise AssertionError(f"{error}\n{self.state}\n{self.truth()}\n{logs}") from None
