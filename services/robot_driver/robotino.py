@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import threading
 import time
 from collections import Counter
@@ -60,6 +61,7 @@ class RobotinoLink:
 
     def open(self) -> None:
         """Begin to read; the robot may answer later."""
+        logging.getLogger("httpx").setLevel(logging.WARNING)  # a line for each of 30 a second
         c = self._config
         for name, path, period_s, limit, take in (
             ("camera", "/cam0", c.camera_period_s, replies.MAX_JPEG_BYTES, self._take_picture),
