@@ -92,7 +92,10 @@ class HardwareConfig(Section):
 class RobotinoConfig(Section):
     """A Festo Robotino 3 or 4 over its REST interface."""
 
-    address: str = Field(default="172.26.1.1:80", min_length=1)
+    address: str = Field(
+        default="172.26.1.1:80",
+        pattern=r"^(\[[0-9A-Fa-f:]+\]|[A-Za-z0-9._-]+)(:[0-9]{1,5})?$",
+    )
     """Host, or host:port."""
     camera_period_s: float = Field(default=0.1, gt=0.0, le=1.0)
     sensor_period_s: float = Field(default=0.1, gt=0.0, le=1.0)

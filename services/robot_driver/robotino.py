@@ -50,12 +50,12 @@ class RobotinoLink:
         self._done = threading.Event()
         self._threads: list[threading.Thread] = []
         command_s = min(robotino.timeout_s, config.robot.hardware.command_period_s)
-        try:
-            self._commands = self._client(command_s)
-        except httpx.InvalidURL as error:
+        port = robotino.address.rpartition(":")[2]
+        if port.isdecimal() and int(port) > 65535:
             raise ConfigError(
-                f"robot.robotino.address: expected host or host:port, got {robotino.address!r}"
-            ) from error
+                f"robot.robotino.address: expected a port up to 65535, got {robotino.address!r}"
+            )
+        self._commands = self._client(command_s)
         self._sequence: int | None = None
         self._picture = b""
 
