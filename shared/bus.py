@@ -371,8 +371,13 @@ def open_router(endpoint: str) -> Iterator[str]:
         reason = re.sub(r" at \S+\.rs:\d+\.?", "", str(error))
         raise ConfigError(f"router: cannot listen on {endpoint!r}: {reason}") from error
     try:
-        replies = session.get(f"@/{session.zid()}/router", timeout=5.0)
-        answers = [json.loads(reply.ok.payload.to_string()) for reply in replies if reply.ok]
-        yield answers[0]["locators"][0] if answers and answers[0]["locators"] else endpoint
+        yield locator(session, endpoint)
     finally:
         session.close()  # type: ignore[no-untyped-call]
+
+
+def locator(session: zenoh.Session, endpoint: str) -> str:
+    """Where a session in router mode really listens: `endpoint` with its port filled in."""
+    replies = session.get(f"@/{session.zid()}/router", timeout=5.0)
+    answers = [json.loads(reply.ok.payload.to_string()) for reply in replies if reply.ok]
+    return str(answers[0]["locators"][0]) if answers and answers[0]["locators"] else endpoint
