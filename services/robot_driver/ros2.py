@@ -162,7 +162,7 @@ class Ros2Link:
 
     def _velocity_type(self) -> tuple[VelocityType, str]:
         """Which type to send (empty: unknown), and what speaks against sending."""
-        if not self._publishers:
+        if not self._publishers or self._done.is_set():
             return cast(VelocityType, ""), "not connected to the robot"
         topic = self._topics["velocity"]
         chosen, obstacle = ros2_names.velocity_type(
@@ -211,7 +211,8 @@ class Ros2Link:
             while self._turn(takers) and not self._done.is_set():
                 pass
             for name, count in self._inbox.refused.copy().items():
-                self.faults[f"{name}: too long or too many"] = count
+                if count:
+                    self.faults[f"{name}: too long or too many"] = count
 
     def _turn(self, takers: dict[str, Callable[[RawSample], None]]) -> bool:
         """Take the most urgent sample; False when there is none."""
