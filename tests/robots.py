@@ -7,9 +7,13 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass
 
+from waiting import wait_until
+
 from services.robot_driver.emulation.faults import Faults
 from services.robot_driver.emulation.robotino import EmulatedRobotino, RobotinoServer
-from services.robot_driver.robot import Pose, Robot
+from services.robot_driver.emulation.ros2 import EmulatedRos2
+from services.robot_driver.emulation.ros2_faults import Ros2Faults
+from services.robot_driver.robot import NotReady, Pose, Robot
 from services.robot_driver.service import make_robot
 from shared.config import Config
 
@@ -83,8 +87,57 @@ def robotino() -> Iterator[Subject]:
             yield Subject(config, robot, lambda: emulated.robot.truth().pose, 1.0)
 
 
+BRIDGE: dict[str, object] = {"transport": "bridge", "battery_topic": "battery_state"}
+"""A base like rto_node's behind zenoh-bridge-ros2dds."""
+RMW_ZENOH: dict[str, object] = {
+    "transport": "rmw-zenoh",
+    "namespace": "bot1",
+    "camera_topic": "oakd/rgb/preview/image_raw/compressed",
+    "camera_type": "CompressedImage",
+    "bumper_topic": "hazard_detection",
+    "bumper_type": "HazardDetectionVector",
+    "bumper_on_change": True,
+}
+"""A Create 3 whose nodes are on Zenoh themselves."""
+
+
+@contextmanager
+def ros2_emulator(faults: Ros2Faults | None = None, **ros2: object) -> Iterator[EmulatedRos2]:
+    """An emulated ROS 2 robot in this process."""
+    config = real_time(kind="ros2", ros2=ros2)
+    sound = Ros2Faults(watchdog_s=5.0)  # test machines stall longer than robots wait
+    listen = "tcp/127.0.0.1:0"
+    with closing(EmulatedRos2(config.robot, "plus", listen, faults or sound)) as emulated:
+        yield emulated
+
+
+def ros2(velocity_type: str, **ros2: object) -> Callable[[], AbstractContextManager[Subject]]:
+    """The ROS 2 driver in front of its emulator, which listens for one type of velocity."""
+
+    @contextmanager
+    def subject() -> Iterator[Subject]:
+        with ros2_emulator(**ros2, velocity_type=velocity_type) as emulated:
+            config = real_time(kind="ros2", ros2={**ros2, "endpoint": emulated.endpoint})
+            with closing(make_robot(config)) as robot:
+                wait_until(lambda: fit(robot), 60, "the robot can be commanded")
+                yield Subject(config, robot, lambda: emulated.robot.truth().pose, 1.0)
+
+    return subject
+
+
+def fit(robot: Robot) -> bool:
+    """Whether a real robot is ready to drive."""
+    try:
+        robot.feel()
+    except NotReady:
+        return False
+    return True
+
+
 SUBJECTS: dict[str, Callable[[], AbstractContextManager[Subject]]] = {
     "sim": simulated,
     "robotino": robotino,
+    "ros2-bridge": ros2("Twist", **BRIDGE),
+    "ros2-rmw-zenoh": ros2("TwistStamped", **RMW_ZENOH),
 }
 """Every driver there is; another one joins by a line here."""

@@ -420,3 +420,26 @@ def run(
         stop.wait()
     finally:
         emulated.close()
+
+
+def change_faults(endpoint: str, items: list[str]) -> str:
+    """Change faults of a running emulator by `name=value` texts; returns them as JSON.
+
+    Raises:
+        ConfigError: A wrong name or value, or no emulator there.
+        RouterMissing: Nothing answers at the endpoint.
+    """
+    changes = {}
+    for item in items:
+        name, equals, value = item.partition("=")
+        if not equals:
+            raise ConfigError(f"expected NAME=VALUE, got {item!r}")
+        changes[name] = value
+    bus = ForeignBus(endpoint)
+    try:
+        answer = bus.ask(FAULTS_KEY, json.dumps(changes).encode())
+    finally:
+        bus.close()
+    if answer is None:
+        raise ConfigError(f"no emulated robot answers at {endpoint}")
+    return answer.decode()
