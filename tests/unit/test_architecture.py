@@ -24,12 +24,31 @@ def imports() -> Iterator[tuple[str, str]]:
                     yield str(path.relative_to(ROOT)), name.split(".")[0]
 
 
+def importers(module: str) -> set[str]:
+    """Files with `from module import ...`."""
+    return {
+        str(path.relative_to(ROOT))
+        for package in PACKAGES
+        for path in (ROOT / package).rglob("*.py")
+        if f"from {module} import" in path.read_text()
+    }
+
+
 def users(package: str) -> set[str]:
     return {file for file, name in imports() if name == package}
 
 
-def test_one_file_imports_zenoh() -> None:
-    assert users("zenoh") == {"shared/bus.py"}
+def test_zenoh_is_imported_by_our_bus_and_by_that_to_foreign_networks() -> None:
+    """Two sessions with nothing in common but the library: see the head of each."""
+    assert users("zenoh") == {"shared/bus.py", "shared/foreign_bus.py"}
+    assert importers("shared.foreign_bus") == {
+        "services/robot_driver/ros2.py",
+        "services/robot_driver/emulation/ros2.py",
+    }
+
+
+def test_one_file_imports_rosbags() -> None:
+    assert users("rosbags") == {"services/robot_driver/cdr.py"}
 
 
 def test_one_file_imports_pybullet() -> None:
