@@ -79,6 +79,8 @@ class Ros2Link:
         self._endpoints: frozenset[Endpoint] = frozenset()
         self._changes_seen = -1
         self._pressed: bool | None = None
+        self._bumper_told = False
+        """Whether the network ever told of somebody who publishes the bumper."""
         self._touch_until_s = -math.inf
         self._robot_clock: tuple[int, float] | None = None
         """Newest stamp of the odometry, and our clock when it arrived."""
@@ -257,9 +259,11 @@ class Ros2Link:
     def _confirm_bumper(self, arrived_s: float) -> None:
         """The robot talks: its bumper, told on change alone, is still as it was last told."""
         there = ros2_names.types_on(self._endpoints, "publishes", self._topics["bumper"])
+        self._bumper_told |= bool(there)
         if self._pressed is None and there:
             self._pressed = False
-        if self._pressed is not None and (there or not self._endpoints):
+        # Where the network tells who publishes, a publisher that went takes the all-clear with it.
+        if self._pressed is not None and (there or not (self._bumper_told or self._endpoints)):
             self.bumper.put(self._pressed, arrived_s)
 
     def _take_battery(self, sample: RawSample) -> None:

@@ -133,7 +133,9 @@ class EmulatedRos2:
 
     def truth(self) -> dict[str, Any]:
         """What the robot really does, and what it counted; times by the monotonic clock."""
-        return {**asdict(self.robot.truth()), "counts": dict(self.counts)}
+        truth = self.robot.truth()
+        commands = [{"at_s": given.at_s, **asdict(given.velocity)} for given in truth.commands]
+        return {**asdict(truth), "commands": commands, "counts": dict(self.counts)}
 
     def close(self) -> None:
         """Leave the network and free the world. May be called twice."""
