@@ -15,7 +15,7 @@ NEW_CLOCK_NS = 10_000_000_000
 back. By less, and what comes is not new until the clock has caught up."""
 MAX_SENDERS = 16
 """Publishers of one topic that are told apart; of more, the longest silent one is forgotten."""
-MOVED_M, MOVED_RAD = 0.05, 0.1
+MOVED_M, MOVED_RAD = 0.01, 0.02
 """A camera that sees the same to the last bit after this way is frozen."""
 
 

@@ -71,7 +71,7 @@ def test_a_moving_robot_sees_something_else_or_its_camera_is_frozen() -> None:
     assert not judge.new(A, THERE)
     assert not judge.new(A, THERE), "it stays so, standing or not"
     assert judge.new(B, THERE)
-    assert judge.new(B, Pose(0.2, 0.0, 0.05))
+    assert judge.new(B, Pose(0.2, 0.005, 0.01))
     assert not judge.new(B, Pose(0.2, 0.0, 0.2)), "turned"
 
 

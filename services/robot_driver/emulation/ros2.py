@@ -120,7 +120,6 @@ class EmulatedRos2:
         with self._lock:
             before, now = self._faults, self._faults.changed(changes)
             self._faults = now
-            self._kept.clear()
             self.robot.configure(stalled=now.odometry == "stalled", watchdog_s=now.watchdog_s)
             if now.closed_s:  # after this was answered
                 self._close_s = time.monotonic() + STEP_S
