@@ -105,29 +105,36 @@ class RobotinoConfig(Section):
     """Of one request, and of one command."""
 
 
+TOPIC = r"^[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*$"
+OPTIONAL_TOPIC = rf"^({TOPIC[1:-1]})?$"
+"""ROS names without a leading slash; they become Zenoh keys."""
+
+
 class Ros2Config(Section):
     """A ROS 2 robot over Zenoh: through zenoh-bridge-ros2dds, or natively through rmw_zenoh."""
 
-    endpoint: str = Field(default="tcp/127.0.0.1:7447", min_length=5)
+    endpoint: str = Field(
+        default="tcp/127.0.0.1:7447", pattern=r"^(tcp|udp|tls|quic)/[^\s/]+:[0-9]{1,5}$"
+    )
     """The bridge, or the router of rmw_zenoh, on the robot."""
     transport: Literal["bridge", "rmw-zenoh"] = "bridge"
     domain: int = Field(default=0, ge=0, le=232)
     """ROS_DOMAIN_ID; rmw-zenoh only."""
     distribution: Literal["humble", "jazzy"] = "jazzy"
     """Humble has no type hashes in its keys; rmw-zenoh only."""
-    namespace: str = Field(default="", pattern=r"^([A-Za-z_][A-Za-z0-9_/]*)?$")
+    namespace: str = Field(default="", pattern=OPTIONAL_TOPIC)
     """Before every topic, without a leading slash."""
-    velocity_topic: str = Field(default="cmd_vel", pattern=r"^[A-Za-z_][A-Za-z0-9_/]*$")
+    velocity_topic: str = Field(default="cmd_vel", pattern=TOPIC)
     velocity_type: Literal["auto", "Twist", "TwistStamped"] = "auto"
     """auto: what the network says the robot listens for."""
-    odometry_topic: str = Field(default="odom", pattern=r"^[A-Za-z_][A-Za-z0-9_/]*$")
-    camera_topic: str = Field(default="image_raw", pattern=r"^[A-Za-z_][A-Za-z0-9_/]*$")
+    odometry_topic: str = Field(default="odom", pattern=TOPIC)
+    camera_topic: str = Field(default="image_raw", pattern=TOPIC)
     camera_type: Literal["Image", "CompressedImage"] = "Image"
-    bumper_topic: str = Field(default="bumper", pattern=r"^[A-Za-z_][A-Za-z0-9_/]*$")
+    bumper_topic: str = Field(default="bumper", pattern=TOPIC)
     bumper_type: Literal["Bool", "HazardDetectionVector"] = "Bool"
     bumper_on_change: bool = False
     """The robot publishes its bumper on change only: odometry then shows that it still talks."""
-    battery_topic: str = Field(default="", pattern=r"^([A-Za-z_][A-Za-z0-9_/]*)?$")
+    battery_topic: str = Field(default="", pattern=OPTIONAL_TOPIC)
     """Empty: none."""
     battery_type: Literal["BatteryState", "PowerReadings"] = "BatteryState"
 
