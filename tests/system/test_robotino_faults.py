@@ -259,3 +259,20 @@ def test_a_stuck_bumper_ends_in_standing_still_and_not_in_pushing(rig: Rig) -> N
     assert math.hypot(after["x_m"] - before["x_m"], after["y_m"] - before["y_m"]) < 2.0
     rig.faults(bumper="")
     rig.wait_driving()
+
+
+def test_an_emergency_stop_while_it_is_not_fit_outlasts_the_fault(rig: Rig) -> None:
+    rig.wait_driving()
+    rig.faults(camera="500")
+    rig.wait_state(lambda state: state.state == "blocked", "it is not fit to drive")
+    assert rig.command("estop").state == "estop"
+    rig.faults(camera="")
+    told = rig.wait_state(lambda state: state.reason == "", "it is fit again")
+    assert told.state == "estop"
+    rig.wait_still(0.0)
+    still_since_s = rig.truth()["still_since_s"]
+    for _ in range(5):
+        rig.wait_state(lambda state: state.state == "estop", "another heartbeat")
+    assert rig.truth()["still_since_s"] == still_since_s
+    rig.command("clear")
+    rig.wait_driving()
