@@ -131,8 +131,7 @@ class CorridorEnv(gymnasium.Env[Image, np.int64]):
 
     def turn(self, left: bool) -> Observation:
         """Turn on the spot for the time of one action, which is none of the three, and look."""
-        self.driver.start_turn(left)
-        self.driver.settle(self.driver.advance(self.config.robot.period_s))
+        self.driver.move("turn-left" if left else "turn-right")
         return self.observe()
 
     def observe(self) -> Observation:

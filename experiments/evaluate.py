@@ -8,15 +8,15 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from experiments import frozen, records, routes
+from experiments import records, routes
 from experiments.choosers import Chooser, Planned, greedy, uniform
 from experiments.environment import CorridorEnv
 from experiments.evaluation import evaluate
 from experiments.traces import Figures
+from services.actor import frozen
 from services.robot_driver.world import WorldError
 from shared.config import Config
 from shared.errors import ConfigError
-from shared.settings import FILE_NAME
 
 LABEL = "evaluate"
 SHOWN = {
@@ -32,12 +32,6 @@ SHOWN = {
     "circling": "actions spent circling",
 }
 SHARES = ("distance", "coverage", "circling")
-
-
-def configuration_of(run: Path) -> Path | None:
-    """The stored configuration of a run, beside its file of weights or above, if there is one."""
-    folders = [run] if run.is_dir() else [run.parent, run.parent.parent]
-    return next((f / FILE_NAME for f in folders if (f / FILE_NAME).is_file()), None)
 
 
 def run(path: Path, config: Config, starts: int, actions: int, out: Path) -> None:

@@ -1,9 +1,7 @@
 """The test drive through I16c: image only, with rotation in place (A45, Fig 4.20, E33).
 
-The network is frozen and acts greedily. Where the reward predicted for its action is negative, the
-robot turns on the spot instead: to the left for forward/left, else to the right, and on in that
-direction until an action with a prediction of 0 or more comes up. At a junction towards the end a
-box is dropped in front of the robot.
+The network is frozen and acts greedily, turning on the spot where it predicts nothing good
+(`shared.rl.spot_turns`). At a junction towards the end a box is dropped in front of the robot.
 """
 
 from __future__ import annotations
@@ -23,7 +21,8 @@ from services.robot_driver.robot import Pose
 from services.robot_driver.world import World
 from shared.messages import Box, Observation, WorldChange, image_array
 from shared.rl.draws import generator
-from shared.rl.policy import FORWARD_LEFT, choose
+from shared.rl.policy import choose
+from shared.rl.spot_turns import SpotTurns
 
 DRIVEN, MOST_DRIVEN = 300, 600
 """Actions of a full tour at least, turns on the spot not counted, and of one that is given up."""
@@ -37,8 +36,6 @@ NEAR_M = 1.0
 """A place is passed within this distance."""
 BOX_AHEAD_M = 1.1
 
-MOST_TURNING_RAD = math.radians(720.0)
-"""A robot that finds no way out after two full turns drives on regardless (E33)."""
 ROLE = "tour"
 
 
@@ -116,9 +113,7 @@ def drive_tour(env: CorridorEnv, network: Predicts, pose: Pose, number: int) -> 
     log = _Log([(pose.x_m, pose.y_m, pose.heading_rad)])
     dropped, dropped_at = False, 0
     draw = generator(number, ROLE)
-    left, turns = 0.0, 0
-    turn_rad = env.config.robot.turn_rad_s * env.config.robot.period_s
-    most_turns = round(MOST_TURNING_RAD / turn_rad)
+    spot_turns, turning = SpotTurns(env.config.robot.turn_rad_s * env.config.robot.period_s), False
     while (driven := sum(log.driven)) < MOST_DRIVEN and len(log.bumps) < 4 * MOST_DRIVEN:
         _tell_passed(world, log)
         if dropped and driven >= max(DRIVEN, dropped_at + BEYOND_BOX) and _full(world, log):
@@ -128,15 +123,14 @@ def drive_tour(env: CorridorEnv, network: Predicts, pose: Pose, number: int) -> 
             observation = env.observe()
         values = network.all_values(image_array(observation.image)[None])[0]
         action, _ = choose(values, GREEDY, draw)
-        if values[action] < 0.0 and turns < most_turns:
-            if not left:
-                left = 1.0 if action == FORWARD_LEFT else -1.0
-                log.tell(f"turns {'left' if left > 0.0 else 'right'} on the spot")
-            observation = env.turn(left > 0.0)
-            turns += 1
+        if side := spot_turns.decide(values, action):
+            if not turning:
+                log.tell(f"turns {side} on the spot")
+            turning = True
+            observation = env.turn(side == "left")
             log.add(env.robot.pose, bump=False, driven=False)
             continue
-        left, turns = 0.0, 0
+        turning = False
         _, _, bumped, _, info = env.step(np.int64(action))
         if bumped:
             _, info = env.reset()

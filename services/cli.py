@@ -325,7 +325,7 @@ def evaluate(
     or change it.
     """
     command = import_role("experiments.evaluate", "experiments")
-    file = config or command.configuration_of(run)
+    file = config or import_role("services.actor.frozen", "actor").configuration_of(run)
     loaded = load(None, file, set_, others={"robot.world": world})
     folder = out or Path(f"evaluation-{loaded.robot.world}")
     command.run(run, loaded, starts, actions, folder)

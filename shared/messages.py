@@ -36,9 +36,11 @@ Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
 MAX_FAULTS = 24
 """Kinds of faults that a driver tells of: the most frequent ones."""
 
-Interruption = Literal["", "pause", "estop", "late", "stop", "restart", "world", "blocked"]
+Interruption = Literal["", "pause", "estop", "late", "stop", "restart", "world", "blocked", "moved"]
 """Why the robot did not simply execute the last action; empty: it did. blocked: a real robot was
 not fit to drive, `RobotState.reason` said why."""
+Motion = Literal["", "turn-left", "turn-right", "forward", "back"]
+"""A motion that is none of the three actions: turning on the spot, or creeping to another place."""
 
 
 class Message(BaseModel):
@@ -102,6 +104,9 @@ class Action(Message):
     """Of the observation answered."""
     action: Annotated[int, Field(ge=0, le=2)] | None
     """0 forward, 1 forward/left, 2 forward/right (A21); None: hold still for one period."""
+    motion: Motion = ""
+    """Instead of an action, which is None then: move like this for one period. A driver that cannot
+    holds still. It counts as no action: `sequence` stays, and the next observation says "moved"."""
     greedy: bool
     values: tuple[float, float, float]
     """Clipped predictions Q(s, a) of the three actions, for the monitor."""
@@ -109,6 +114,19 @@ class Action(Message):
     episode: Count = 0
     """Counted episodes of the robot so far, as far as the actor knows; 0 while the memory fills.
     Changes of the world wait for it (`WorldChange.at_episode`)."""
+    filling: bool = False
+    """Chosen to fill the memory (A13)."""
+    fills: Count = 0
+    """Fill submissions of the robot so far. With seed, policy and values, `step` and, by `filling`,
+    this or `episode` decide the choice: anyone can repeat it."""
+    step: Count = 0
+    """Steps in the robot's open episode before this one."""
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        if self.motion and self.action is not None:
+            raise ValueError(f"motion {self.motion!r}: expected no action beside it")
+        return self
 
 
 class RobotCommand(Message):

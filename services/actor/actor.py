@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from services.actor.decision import decide
 from shared.config import Config
 from shared.messages import Action, Episode, Observation, RobotProgress, image_array
-from shared.rl.draws import generator
 from shared.rl.episode import Ending, OpenEpisode, Release, Step, stale_steps, with_current_max_q
-from shared.rl.policy import Values, choose, choose_uniformly
+from shared.rl.policy import Values
 from shared.rl.predictor import Predictor
 from shared.rl.reward import episode_rewards
 
@@ -110,19 +110,16 @@ class Actor:
         if values is None:
             image = image_array(observation.image)
             values = self.predictor.all_values(image[np.newaxis])[0]
-        number = len(self.open)
-        if self.progress.filling:
-            episode = self.progress.robot_fills
-            draw = generator(self._config.run.seed, "fill", self._robot, episode, number)
-            uniform = self._config.memory.fill == "random"
-        else:
-            episode = self.progress.robot_episodes
-            draw = generator(self._config.run.seed, "policy", self._robot, episode, number)
-            uniform = False
-        if uniform:
-            action, greedy = choose_uniformly(draw), False
-        else:
-            action, greedy = choose(values, self._config.policy, draw)
+        progress, number = self.progress, len(self.open)
+        episode = progress.robot_fills if progress.filling else progress.robot_episodes
+        action, greedy = decide(
+            self._config,
+            self._robot,
+            values,
+            filling=progress.filling,
+            episode=episode,
+            step=number,
+        )
         version = self.predictor.version
         self.open.add(
             Step(
@@ -153,7 +150,10 @@ class Actor:
             greedy=greedy,
             values=(float(values[0]), float(values[1]), float(values[2])),
             weights_version=version,
-            episode=self.progress.robot_episodes,
+            episode=progress.robot_episodes,
+            filling=progress.filling,
+            fills=progress.robot_fills,
+            step=number,
         )
 
     def state(self) -> dict[str, Any]:

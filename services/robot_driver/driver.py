@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Literal
 
 from services.robot_driver.changes import Changes, Outcome, described
-from services.robot_driver.recovery import Halted, WatchedRobot, back_off
+from services.robot_driver.recovery import Halted, WatchedRobot, back_off, let_go
 from services.robot_driver.robot import STANDSTILL, NotReady, Pose, Robot, Velocity
 from services.robot_driver.safety import Safety
 from shared.config import Config
@@ -20,6 +21,7 @@ from shared.messages import (
     Action,
     Fault,
     Interruption,
+    Motion,
     Observation,
     RobotState,
     WorldChange,
@@ -37,6 +39,15 @@ def action_velocity(config: Config, action: int) -> Velocity:
     """Body velocity of an action (A21): forward, turning for forward/left and forward/right."""
     sense = {FORWARD_LEFT: 1.0, FORWARD_RIGHT: -1.0}.get(action, 0.0)
     return Velocity(config.robot.speed_m_s, 0.0, sense * config.robot.turn_rad_s)
+
+
+def motion_velocity(config: Config, motion: Motion) -> Velocity:
+    """Body velocity of a motion that is no action: turning as in actions (A45), or creeping."""
+    robot = config.robot
+    if motion in ("turn-left", "turn-right"):
+        return Velocity(0.0, 0.0, robot.turn_rad_s if motion == "turn-left" else -robot.turn_rad_s)
+    sense = {"forward": 1.0, "back": -1.0}.get(motion, 0.0)
+    return Velocity(sense * robot.recovery_speed_m_s, 0.0, 0.0)
 
 
 class Driver:
@@ -63,6 +74,8 @@ class Driver:
         self._bump = False
         self._interruption: Interruption = ""
         self._moving = False
+        self._motion: Motion = ""
+        """The motion in force, or just over; empty: an action."""
         self._pose = Pose(0.0, 0.0, 0.0)
 
     @property
@@ -111,19 +124,37 @@ class Driver:
 
     def start(self, action: int) -> None:
         """Begin to drive an action, within the limits."""
+        self._motion = ""
         self._drive(self.safety.allow(action_velocity(self._config, action), self._robot.now_s()))
         self.state = "driving"
 
-    def start_turn(self, left: bool) -> None:
-        """Begin to turn on the spot, within the limits (A45)."""
-        turn_rad_s = math.copysign(self._config.robot.turn_rad_s, 1.0 if left else -1.0)
-        velocity = Velocity(0.0, 0.0, turn_rad_s)
+    def move(self, motion: Motion) -> None:
+        """Lockstep: carry out one whole motion that is no action."""
+        if self.start_motion(motion):
+            self.settle(self.advance(self._config.robot.period_s))
+        else:
+            self.look_again("")
+
+    def start_motion(self, motion: Motion) -> bool:
+        """Begin to turn on the spot or to creep, within the limits.
+
+        False: the bumper is pressed, so the robot stands still; nobody knows from which side.
+        """
+        if self._robot.feel().contact:
+            self.halt()
+            return False
+        self._motion = motion
+        velocity = motion_velocity(self._config, motion)
         self._drive(self.safety.allow(velocity, self._robot.now_s()))
         self.state = "driving"
+        return True
 
     def advance(self, duration_s: float) -> bool:
-        """Let time pass; True at contact, where the robot has already stopped (unless `none`)."""
-        stop = self._config.robot.recovery != "none"
+        """Let time pass; True at contact, where the robot has already stopped.
+
+        With the recovery `none` contact does not stop an action, but it does stop a motion.
+        """
+        stop = self._config.robot.recovery != "none" or self._motion != ""
         contact = self._robot.run(duration_s, stop_on_contact=stop)
         if contact and stop:
             self._drive(STANDSTILL)
@@ -139,13 +170,19 @@ class Driver:
             self._drive(STANDSTILL)
 
     def settle(self, bump: bool, *, executed: bool = True) -> None:
-        """The action is over: count it, recover from a bump, look anew.
+        """The action or motion is over: count it, recover from a bump, look anew.
 
         Realtime only: a bump before the newest observation was answered (not `executed`) belongs to
-        the action before it, so the number stays.
+        the action before it, so the number stays. A motion never counts as an action; after a bump
+        the robot only lets go of what it touched.
         """
         self._bump, self._interruption = bump, ""
         self.bumps += int(bump)
+        if self._motion:
+            if bump:
+                self._let_go(self._motion)
+            self.look_again("moved")
+            return
         if bump and self._config.robot.recovery == "back-off":
             self._recover()
         if executed:
@@ -179,6 +216,7 @@ class Driver:
 
     def halt(self) -> None:
         """Stand still now; may be called in any state."""
+        self._motion = ""
         self._drive(STANDSTILL)
 
     def command(self, command: Literal["estop", "clear", "pause", "resume"]) -> None:
@@ -334,11 +372,10 @@ class Driver:
         """Back off by real motion and turn to a random heading drawn from the seed (E11)."""
         self.state = "recovering"
         draw = generator(self._config.run.seed, "recovery", self._config.robot.id, self.sequence)
-        robot = WatchedRobot(
-            self._robot, self.safety, self.watch, SLICE_S if self._realtime else None
-        )
+        heading_rad = float(draw.uniform(-math.pi, math.pi))
         try:
-            back_off(robot, self._config.robot, float(draw.uniform(-math.pi, math.pi)))
+            robot = self._watched()
+            back_off(robot, self._config.robot, heading_rad)
             if self._config.robot.kind != "sim":  # it still moves when told to stop
                 robot.run(self._config.robot.hardware.rest_s, stop_on_contact=False)
             self.recoveries += 1
@@ -347,3 +384,17 @@ class Driver:
         except NotReady:  # it stands; the next look tells why, and the actor
             self.halt()
         self._moving = False
+
+    def _let_go(self, motion: Motion) -> None:
+        """After contact in a straight motion: back the way it came until the bumper is free."""
+        direction = {"forward": -1.0, "back": 1.0}.get(motion)
+        if direction is None:
+            return
+        self.state = "recovering"
+        with suppress(Halted):
+            let_go(self._watched(), self._config.robot, direction)
+        self._moving = False
+
+    def _watched(self) -> WatchedRobot:
+        slice_s = SLICE_S if self._realtime else None
+        return WatchedRobot(self._robot, self.safety, self.watch, slice_s)

@@ -58,6 +58,8 @@ class WatchedRobot:
 
 RELEASE_M = 0.05
 """Way driven regardless of the bumper, to let go of the wall that pressed it."""
+LET_GO_M = 0.1
+"""Farthest way back out of the contact that a motion by hand ended in."""
 
 
 def back_off(robot: Robot, config: RobotConfig, heading_rad: float) -> float:
@@ -85,10 +87,34 @@ def back_off(robot: Robot, config: RobotConfig, heading_rad: float) -> float:
     return _distance(start, here)
 
 
+def let_go(robot: Robot, config: RobotConfig, direction: float) -> None:
+    """Creep straight until the bumper is free, at most `LET_GO_M`; stand still then.
+
+    Args:
+        robot: Its bumper was free before it moved the other way.
+        config: Speed and limits.
+        direction: 1.0 forward, -1.0 backwards.
+
+    Raises:
+        RobotFault: The robot cannot be read or commanded.
+    """
+    speed, left = _creeping(config), LET_GO_M
+    while left > 0.0 and robot.feel().contact:
+        part = min(left, RELEASE_M)
+        robot.drive(Velocity(direction * speed, 0.0, 0.0))
+        robot.run(part / speed, stop_on_contact=False)
+        robot.drive(STANDSTILL)
+        left -= part
+
+
+def _creeping(config: RobotConfig) -> float:
+    return min(config.recovery_speed_m_s, config.max_speed_m_s)
+
+
 def _move(robot: Robot, config: RobotConfig, distance_m: float) -> bool:
     """Drive straight, backwards if negative; return whether a wall ended it."""
     left = abs(distance_m)
-    speed = min(config.recovery_speed_m_s, config.max_speed_m_s)
+    speed = _creeping(config)
     pressed = robot.feel().contact
     while left > 0.0:
         part = min(left, RELEASE_M) if pressed else left

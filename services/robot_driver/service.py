@@ -172,7 +172,9 @@ class DriverLoop:
         action = self._await_answer(observation)
         if action is None or self._driver.apply_due(action.episode):
             return
-        if action.action is None:
+        if action.motion:
+            self._driver.move(action.motion)
+        elif action.action is None:
             self._driver.look_again("")
         else:
             self._driver.execute(action.action)
@@ -238,7 +240,10 @@ class DriverLoop:
                     continue
                 if driver.apply_due(action.episode):
                     return
-                if action.action is None:
+                if action.motion:
+                    started = driver.start_motion(action.motion)
+                    hold = not started
+                elif action.action is None:
                     hold = True
                     driver.halt()
                 else:

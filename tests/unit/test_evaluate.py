@@ -9,8 +9,9 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from experiments import frozen, records, routes
+from experiments import records, routes
 from services import cli
+from services.actor import frozen
 from services.learner import checkpoint
 from shared.config import Config, NetworkConfig
 from shared.rl.learning import Trainer

@@ -12,6 +12,7 @@ from safetensors.torch import save as save_safetensors
 from shared.config import ActorNumerics, NetworkConfig
 from shared.errors import ConfigError, StateError
 from shared.rl.predictor import Predictor
+from shared.settings import FILE_NAME
 
 CHECKPOINT = Path("learner") / "checkpoint.safetensors"
 WEIGHTS = Path("weights.safetensors")
@@ -59,6 +60,12 @@ def find(run: Path) -> Path:
     if not run.exists():
         raise ConfigError(f"run {run}: there is no such folder or file")
     raise ConfigError(f"run {run}: expected {CHECKPOINT} or {WEIGHTS} in it, found neither")
+
+
+def configuration_of(run: Path) -> Path | None:
+    """The stored configuration of a run, beside its file of weights or above, if there is one."""
+    folders = [run] if run.is_dir() else [run.parent, run.parent.parent]
+    return next((f / FILE_NAME for f in folders if (f / FILE_NAME).is_file()), None)
 
 
 def read(path: Path) -> Frozen:

@@ -1,0 +1,45 @@
+"""Turning on the spot where nothing good is predicted (A45, Fig 4.20, E33).
+
+A frozen network acts greedily. Where the reward predicted for its action is negative, the robot
+turns on the spot instead: to the left for forward/left, else to the right, and on in that direction
+until an action with a prediction of 0 or more comes up.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from shared.rl.policy import FORWARD_LEFT, Values
+
+MOST_TURNING_RAD = math.radians(720.0)
+"""A robot that finds no way out after two full turns drives on regardless (E33)."""
+Side = Literal["", "left", "right"]
+
+
+class SpotTurns:
+    """When to turn on the spot, and to which side.
+
+    Args:
+        turn_rad: Of one turn, which lasts as long as an action.
+    """
+
+    def __init__(self, turn_rad: float) -> None:
+        self._most = round(MOST_TURNING_RAD / turn_rad)
+        self._side: Side = ""
+        self._turns = 0
+
+    def decide(self, values: Values, action: int) -> Side:
+        """The side to turn to now, or empty: drive the action.
+
+        Args:
+            values: Clipped predictions of the three actions.
+            action: The best of them.
+        """
+        if values[action] >= 0.0 or self._turns >= self._most:
+            self._side, self._turns = "", 0
+            return ""
+        if not self._side:
+            self._side = "left" if action == FORWARD_LEFT else "right"
+        self._turns += 1
+        return self._side
