@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from services import cli_driving
 from services.cli_robots import emulate
 from services.cli_worlds import obstacle, world
 from services.monitor.tether import tether
@@ -57,6 +58,7 @@ app = typer.Typer(
 app.add_typer(world, name="world")
 app.add_typer(obstacle, name="obstacle")
 app.add_typer(emulate, name="emulate")
+cli_driving.add_to(app)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -9,7 +9,8 @@ CorridorError
     ├── RouterMissing  no router at the endpoint (yet)
     ├── PeerMissing    nobody serves this request now
     ├── PeerSilent     served, but no complete answer in time
-    └── PeerRefused    answered with an error; the text is the peer's
+    ├── PeerRefused    answered with an error; the text is the peer's
+    └── RobotTaken     somebody else commands this robot
 """
 
 
@@ -51,3 +52,7 @@ class PeerSilent(BusError):
 
 class PeerRefused(BusError):
     """The peer answered with an error."""
+
+
+class RobotTaken(BusError):
+    """Somebody else commands this robot: there is one commander at a time."""

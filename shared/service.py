@@ -183,17 +183,24 @@ def service(name: str, ident: str, config: Config, *, life: str | None = None) -
     with _connect(name, config, stop) as bus:
         me = Service(name, ident, life or new_life(), config, bus, stop)
         me.meet()
-        control = bus.inbox()
-        control.serve(SERVICE, f"{name}-{ident}")
-        thread = threading.Thread(target=me.serve_control, args=(control,), daemon=True)
-        thread.start()
-        me.log.info("%s %r of run %r is up (life %s)", name, ident, config.run.name, me.life)
-        try:
+        with controlled(me):
+            me.log.info("%s %r of run %r is up (life %s)", name, ident, config.run.name, me.life)
             yield me
-        finally:
-            stop.set("finished")
-            thread.join(2.0)
-            me.log.info("%s %r stops: %s", name, ident, stop.reason)
+
+
+@contextmanager
+def controlled(me: Service) -> Iterator[None]:
+    """Answer `ping` and `stop` while the block runs; the stop flag is set at its end."""
+    control = me.bus.inbox()
+    control.serve(SERVICE, f"{me.name}-{me.ident}")
+    thread = threading.Thread(target=me.serve_control, args=(control,), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        me.stop.set("finished")
+        thread.join(2.0)
+        me.log.info("%s %r stops: %s", me.name, me.ident, me.stop.reason)
 
 
 def _connect(name: str, config: Config, stop: StopFlag) -> Bus:

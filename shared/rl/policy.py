@@ -56,6 +56,11 @@ def choose(values: Values, config: PolicyConfig, rng: np.random.Generator) -> tu
     return _pick(chances, float(draw)), greedy
 
 
+def choose_greedily(values: Values, rng: np.random.Generator) -> int:
+    """The best action, exact ties drawn (E8); draws from `rng` as `choose` does."""
+    return _pick(greedy_distribution(values), float(rng.random(2)[1]))
+
+
 def choose_uniformly(rng: np.random.Generator) -> int:
     """A uniformly random action, to fill the memory before learning starts (E9)."""
     return int(rng.integers(ACTIONS))
