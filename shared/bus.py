@@ -10,9 +10,11 @@ import json
 import logging
 import re
 import threading
+import time
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
@@ -29,13 +31,15 @@ from shared.errors import (
     PeerSilent,
     RouterMissing,
 )
-from shared.keys import IDENT, Peer, Stream, alive_key, parse_alive
+from shared.keys import Peer, Stream, alive_key, ident_in, parse_alive
 from shared.messages import Message
 
 log = logging.getLogger(__name__)
 M = TypeVar("M", bound=Message)
 MAX_SENDERS = 64
 """Senders of one `latest` stream an inbox keeps apart; more are refused and counted."""
+TAP_MESSAGES, TAP_BYTES = 20_000, 64 * 1024 * 1024
+"""Most that waits at a tap."""
 REPLY_LIMIT = 16 * 1024 * 1024
 """Bytes of one reply; larger ones are refused."""
 
@@ -117,7 +121,7 @@ class Inbox:
 
         def on_sample(sample: zenoh.Sample) -> None:
             payload = sample.payload
-            sender = self._sender(stream, str(sample.key_expr))
+            sender = ident_in(stream, str(sample.key_expr))
             with self._ready:
                 slot = (stream.name, sender or "")
                 full = slot not in self._latest and len(self._latest) >= MAX_SENDERS
@@ -215,17 +219,67 @@ class Inbox:
         """All messages not taken so far."""
         return sum(self.refused.values())
 
-    def _sender(self, stream: Stream, key: str) -> str | None:
-        """The id in a concrete key; None for wildcards and foreign forms, "main" for none."""
-        pattern, chunks = stream.pattern.split("/"), key.split("/")
-        if len(pattern) != len(chunks):
-            return None
-        for expected, chunk in zip(pattern, chunks, strict=True):
-            if not IDENT.fullmatch(chunk):
-                return None
-            if expected == "{id}":
-                return chunk
-        return "main"
+
+@dataclass(frozen=True)
+class Heard:
+    """A published message as it came: nothing of it is checked but its size and its key."""
+
+    stream: Stream
+    ident: str
+    """Of the sender, from the key."""
+    time_ns: int
+    """When it arrived, by the clock of this computer since 1970."""
+    data: bytes
+
+
+class Tap:
+    """Every message of `latest` streams, in the order of arrival, for one thread that keeps up.
+
+    At most `TAP_MESSAGES` of them and `TAP_BYTES` wait; what comes beyond that is lost and counted.
+    """
+
+    def __init__(self, bus: Bus, streams: Sequence[Stream]) -> None:
+        self._bus = bus
+        self._ready = threading.Condition()
+        self._waiting: deque[Heard] = deque()
+        self._bytes = 0
+        self._woken = False
+        self.lost: Counter[str] = Counter()
+        """Messages not taken, by stream: too many waiting, oversized or badly addressed."""
+        for stream in streams:
+            self._listen(stream)
+
+    def _listen(self, stream: Stream) -> None:
+        def on_sample(sample: zenoh.Sample) -> None:
+            payload = sample.payload
+            ident = ident_in(stream, str(sample.key_expr))
+            with self._ready:
+                size = len(payload)
+                room = len(self._waiting) < TAP_MESSAGES and self._bytes + size <= TAP_BYTES
+                if ident is None or size > stream.max_bytes or not room:
+                    self.lost[stream.name] += 1
+                    return
+                self._waiting.append(Heard(stream, ident, time.time_ns(), payload.to_bytes()))
+                self._bytes += size
+                self._ready.notify_all()
+
+        self._bus.subscriber(stream.wildcard(self._bus.run), on_sample)
+
+    def take(self, timeout_s: float) -> list[Heard]:
+        """All that waits, as soon as there is something; empty at the timeout or when woken."""
+        with self._ready:
+            self._ready.wait_for(lambda: bool(self._waiting) or self._woken, timeout_s)
+            self._woken = False
+            taken = list(self._waiting)
+            self._waiting.clear()
+            self._bytes = 0
+            return taken
+
+    def wake(self) -> None:
+        """Let `take` return (any thread)."""
+        with self._ready:
+            self._woken = True
+            self._ready.notify_all()
 
 
 class Bus:
@@ -266,6 +320,10 @@ class Bus:
     def inbox(self) -> Inbox:
         """A new inbox for one thread."""
         return Inbox(self)
+
+    def tap(self, streams: Sequence[Stream]) -> Tap:
+        """Hear everything of these `latest` streams from now on."""
+        return Tap(self, streams)
 
     def subscriber(self, key: str, callback: Any) -> None:
         """Declare a subscriber that lives as long as the bus.

@@ -59,6 +59,20 @@ class Stream:
         return self.pattern.format(run=run, id="*")
 
 
+def ident_in(stream: Stream, key: str) -> str | None:
+    """The id in a concrete key; None for wildcards and foreign forms, "main" for none."""
+    pattern, chunks = stream.pattern.split("/"), key.split("/")
+    if len(pattern) != len(chunks):
+        return None
+    ident = "main"
+    for expected, chunk in zip(pattern, chunks, strict=True):
+        if not IDENT.fullmatch(chunk) or (not expected.startswith("{") and chunk != expected):
+            return None
+        if expected == "{id}":
+            ident = chunk
+    return ident
+
+
 NEWEST = "newer replaces unread older"
 BUSY = "error reply 'busy', the asker repeats"
 

@@ -1,0 +1,1 @@
+"""Records what the services of a run publish, and reads recordings back."""

@@ -1,0 +1,112 @@
+"""`corridor drive`: a frozen network drives a robot that does not know the difference (A45)."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from cluster import Cluster, make_config
+from safetensors.torch import load, save
+from waiting import wait_until
+
+from shared.bus import Bus
+from shared.config import Config
+from shared.keys import ACTION, OBSERVATION
+from shared.messages import Action, Observation
+from shared.rl.network import initialised, to_bytes
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]
+DEADLINE_S = 200.0
+REALTIME = {"timing": "realtime", "period_s": 0.2, "deadman_s": 0.4}
+
+
+def weights_of(config: Config, folder: Path, bias: float) -> Path:
+    """A network that predicts about `bias` for everything."""
+    tensors = load(to_bytes(initialised(config.network, seed=3)))
+    tensors["out.weight"] *= 0.01
+    tensors["out.bias"][:] = bias
+    path = folder / "weights.safetensors"
+    path.write_bytes(save(tensors))
+    return path
+
+
+def corridor(cluster: Cluster, *words: object) -> subprocess.Popen[str]:
+    """A command beside the cluster."""
+    place = ["--endpoint", cluster.config.bus.endpoint, "--run", cluster.config.run.name]
+    return subprocess.Popen(
+        [sys.executable, "-m", "services.cli", *map(str, words), *place],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def drive(cluster: Cluster, weights: Path, *words: object) -> subprocess.Popen[str]:
+    filters = f"network.filters={cluster.config.network.filters}"
+    return corridor(cluster, "drive", "--weights", weights, "--set", filters, *words)
+
+
+def heard(bus: Bus) -> list[Observation]:
+    inbox = bus.inbox()
+    inbox.subscribe(OBSERVATION)
+    looks: list[Observation] = []
+
+    def enough() -> bool:
+        inbox.wait(0.2)
+        looks.extend(o for _, o in inbox.take(OBSERVATION, Observation))
+        return len(looks) >= 5
+
+    wait_until(enough, DEADLINE_S, "observations")
+    return looks
+
+
+@pytest.mark.parametrize("robot", [{}, REALTIME], ids=["lockstep", "realtime"])
+def test_a_frozen_network_drives(robot: dict[str, object], run_name: str, tmp_path: Path) -> None:
+    config = make_config(run_name, robot=robot)
+    with Cluster(config, tmp_path / "run") as cluster:
+        cluster.start("router", "driver")
+        before = heard(cluster.bus)[0]
+        with drive(cluster, weights_of(config, tmp_path, 0.5), "--actions", 12) as process:
+            said, _ = process.communicate(timeout=DEADLINE_S)
+        assert process.returncode == 0, said
+        assert "12 actions, 0 turns on the spot" in said
+        after = heard(cluster.bus)[-1]
+        assert after.sequence == before.sequence + 12
+        assert (after.x_m, after.y_m) != (before.x_m, before.y_m)
+        cluster.stop("driver", "router")
+
+
+@pytest.mark.parametrize("robot", [{}, REALTIME], ids=["lockstep", "realtime"])
+def test_it_turns_on_the_spot_where_it_predicts_nothing_good(
+    robot: dict[str, object], run_name: str, tmp_path: Path
+) -> None:
+    config = make_config(run_name, robot=robot)
+    with Cluster(config, tmp_path / "run") as cluster:
+        cluster.start("router", "driver")
+        inbox = cluster.bus.inbox()
+        inbox.subscribe(ACTION)
+        before = heard(cluster.bus)[0]
+        with drive(cluster, weights_of(config, tmp_path, -0.5)) as process:
+            turned: list[Observation] = []
+
+            def turns() -> bool:
+                turned.extend(o for o in heard(cluster.bus) if o.interruption == "moved")
+                return len({o.heading_rad for o in turned}) >= 3
+
+            cluster.wait(turns, DEADLINE_S, "turns on the spot")
+            asked = [a for _, a in inbox.take(ACTION, Action)]
+            second = drive(cluster, weights_of(config, tmp_path, -0.5))
+            refused, _ = second.communicate(timeout=DEADLINE_S)
+            assert second.returncode == 1
+            assert "is commanded by actor 'robotino1'" in refused
+            process.send_signal(2)
+            said, _ = process.communicate(timeout=DEADLINE_S)
+        assert process.returncode == 0, said
+        assert all(a.action is None and a.motion in ("turn-left", "turn-right") for a in asked)
+        looks = heard(cluster.bus)
+        assert {(o.x_m, o.y_m) for o in turned} <= {(before.x_m, before.y_m)}
+        assert len({o.heading_rad for o in looks[2:]}) == 1  # it stands
+        cluster.stop("driver", "router")
