@@ -64,6 +64,13 @@ def load(
     return merged.validate()
 
 
+def from_toml(text: str, source: str) -> Config:
+    """The configuration in a text, such as one by `to_toml`; raises ConfigError naming `source`."""
+    merged = _Merged()
+    merged.add_tree(_parse(text.encode(), source), source)
+    return merged.validate()
+
+
 def preset_names() -> list[str]:
     """Names of the presets that come with the package."""
     folder = resources.files("experiments").joinpath("presets")

@@ -9,11 +9,11 @@ import json
 import re
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -32,12 +32,13 @@ from services.recorder.recording import (
     Origin,
 )
 from shared import messages as m
+from shared import settings
 from shared.codec import decode
 from shared.config import ActorNumerics
 from shared.errors import BadMessage, ConfigError, StateError
 from shared.keys import Stream, ident_in
-from shared.settings import from_toml
 
+T = TypeVar("T")
 MAGIC = b"\x89MCAP0\r\n"
 MAX_RECORD_BYTES = 128 * 1024 * 1024
 """A longer record, of weights for instance, is refused."""
@@ -89,7 +90,7 @@ class Recording:
         about: dict[str, dict[str, str]] = {}
         for offset, opcode, body in self._records(whole=False):
             if opcode == Opcode.METADATA:
-                found = self._parse(Metadata, body)
+                found = self._parse(Metadata.read, body)
                 if found.name in (RECORDING, CONFIG):
                     about.setdefault(found.name, found.metadata)
                 elif found.name == SUMMARY:
@@ -111,15 +112,15 @@ class Recording:
         channels: dict[int, tuple[Stream, str] | None] = {}
         for _, opcode, body in self._records(whole=True):
             if opcode == Opcode.CHUNK:
-                inside = self._in_chunk(self._parse(Chunk, body))
+                inside = self._in_chunk(self._parse(Chunk.read, body))
             else:
                 inside = iter([(opcode, body)])
             for kind, part in inside:
                 if kind == Opcode.SCHEMA and len(schemas) < MAX_CHANNELS:
-                    schema = self._parse(Schema, part)
+                    schema = self._parse(Schema.read, part)
                     schemas[schema.id] = schema
                 elif kind == Opcode.CHANNEL and len(channels) < MAX_CHANNELS:
-                    channel = self._parse(Channel, part)
+                    channel = self._parse(Channel.read, part)
                     channels[channel.id] = self._stream(channel, schemas)
                 elif kind == Opcode.MESSAGE:
                     recorded = self._message(part, channels)
@@ -133,7 +134,8 @@ class Recording:
         with self._path.open("rb") as file:
             file.seek(weights.offset)
             _, body = self._record(file, self._path.stat().st_size) or (0, b"")
-        return self._parse(Attachment, body).data
+        data: bytes = self._parse(Attachment.read, body).data
+        return data
 
     def _records(self, *, whole: bool) -> Iterator[tuple[int, int, bytes]]:
         """Offset, opcode and content of the records up to where the file ends or breaks off.
@@ -169,7 +171,9 @@ class Recording:
         if length > size - file.tell():
             return None
         if length > MAX_RECORD_BYTES:
-            raise StateError(f"{self._path}: a record of {length} bytes, at most {MAX_RECORD_BYTES}")
+            raise StateError(
+                f"{self._path}: a record of {length} bytes, at most {MAX_RECORD_BYTES}"
+            )
         if opcode in skip:
             file.seek(length, 1)
             return opcode, b""
@@ -194,10 +198,15 @@ class Recording:
             yield opcode, bytes(data[place : place + length])
             place += length
 
-    def _parse[T](self, record: type[T], body: bytes) -> T: ...
+    def _parse(self, read: Callable[[ReadDataStream], T], body: bytes) -> T:
+        """A record from its content, by the reader of its class. Raises StateError."""
+        try:
+            return read(ReadDataStream(BytesIO(body)))
+        except (McapError, struct.error, UnicodeDecodeError) as error:
+            raise StateError(f"{self._path}: damaged: {error or type(error).__name__}") from error
 
     def _note_weights(self, offset: int, body: bytes) -> None:
-        attachment = self._parse(Attachment, body)
+        attachment = self._parse(Attachment.read, body)
         number = attachment.name.removeprefix(WEIGHTS)
         if attachment.name == number or not NUMBER.fullmatch(number):
             return
@@ -219,7 +228,7 @@ class Recording:
     def _message(
         self, body: bytes, channels: dict[int, tuple[Stream, str] | None]
     ) -> Recorded | None:
-        message = self._parse_message(body)
+        message = self._parse(lambda stream: Message.read(stream, len(body)), body)
         where = channels.get(message.channel_id)
         if where is None or len(message.data) > where[0].max_bytes:
             return None
@@ -235,7 +244,7 @@ class Recording:
     def _origin(self, about: dict[str, dict[str, str]]) -> Origin:
         try:
             facts = about[RECORDING]
-            config = from_toml(about[CONFIG]["toml"], f"{self._path}")
+            config = settings.from_toml(about[CONFIG]["toml"], str(self._path))
             numerics = ActorNumerics.model_validate(json.loads(facts["numerics.actor"]))
             protocol, preprocessing = int(facts["protocol"]), int(facts["preprocessing"])
         except KeyError as error:

@@ -69,9 +69,7 @@ class RecordingWriter:
         self._schemas: dict[str, int] = {}
         self._run = origin.config.run.name
         self._file = _create(path)
-        self._writer = Writer(
-            self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE
-        )
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
         self._writer.start(PROFILE)
         about = {
             "run": self._run,
@@ -93,7 +91,7 @@ class RecordingWriter:
         trace: TracebackType | None,
     ) -> None:
         try:
-            self._writer.finish()
+            self._writer.finish()  # type: ignore[no-untyped-call]
         finally:
             self._file.close()
 
@@ -124,7 +122,7 @@ class RecordingWriter:
 
     def flush(self) -> None:
         """Hand everything so far to the operating system."""
-        self._writer.flush()
+        self._writer.flush()  # type: ignore[no-untyped-call]
 
     def _channel(self, stream: Stream, ident: str) -> int | None:
         place = (stream.name, ident)

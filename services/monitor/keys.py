@@ -1,0 +1,94 @@
+"""From bytes of a terminal to keys, and from keys to what a person wants: pure, time is given."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from shared.messages import Motion
+
+DEADMAN_S = 0.3
+"""Without another press of a key for so long the robot stops. Keyboards repeat faster."""
+Command = Literal["", "estop", "quit"]
+MOTIONS: dict[str, Motion] = {
+    "w": "forward",
+    "s": "back",
+    "a": "turn-left",
+    "d": "turn-right",
+    "up": "forward",
+    "down": "back",
+    "left": "turn-left",
+    "right": "turn-right",
+}
+ARROWS = {"A": "up", "B": "down", "C": "right", "D": "left"}
+ESCAPE = "\x1b"
+LONGEST = 16
+"""Characters of a sequence."""
+
+
+class KeyParser:
+    """Cuts what a terminal sends into keys; arrows are sequences, which may come in pieces."""
+
+    def __init__(self) -> None:
+        self._begun = ""
+
+    def feed(self, data: bytes) -> list[str]:
+        """The keys that are complete now: a character each, or the name of an arrow.
+
+        Any other sequence, and ESC alone once the next key comes, is one key `escape`.
+        """
+        keys = (self._next(character) for character in data.decode("latin-1"))
+        return [key for some in keys for key in some]
+
+    def _next(self, character: str) -> list[str]:
+        begun = self._begun
+        if character == ESCAPE:
+            self._begun = ESCAPE
+            return ["escape"] if begun else []
+        if not begun:
+            return [character]
+        if begun == ESCAPE and character in "[O":
+            self._begun += character
+            return []
+        if begun != ESCAPE and " " <= character <= "?" and len(begun) < LONGEST:
+            self._begun += character  # what modifies a key, such as Ctrl
+            return []
+        self._begun = ""
+        if begun == ESCAPE:
+            return ["escape", character]
+        return [ARROWS.get(character, "escape") if len(begun) == len(ESCAPE) + 1 else "escape"]
+
+
+@dataclass
+class Wish:
+    """What the person at the keys wants now.
+
+    A motion is wanted for `DEADMAN_S` after its key; any other key ends it at once.
+    """
+
+    command: Command = ""
+    """Last asked for; taken by `take_command`."""
+    _motion: Motion = ""
+    _until_s: float = -math.inf
+
+    def press(self, key: str, now_s: float) -> None:
+        """A key was pressed, or repeated."""
+        key = key.lower()
+        self._motion = MOTIONS.get(key, "")
+        self._until_s = now_s + DEADMAN_S
+        if key == "e":
+            self.command = "estop"
+        elif key == "q" and self.command != "estop":
+            self.command = "quit"
+
+    def motion(self, now_s: float) -> Motion:
+        """The motion that is wanted; empty: stand still."""
+        if now_s >= self._until_s:
+            self._motion = ""
+        return self._motion
+
+    def take_command(self) -> Command:
+        """What was asked for since the last call. An emergency stop goes before everything."""
+        command, self.command = self.command, ""
+        return command
