@@ -13,7 +13,7 @@ import termios
 import time
 import tty
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from services.monitor.keys import KeyParser, Wish
 from shared.commander import Commander, commanding
@@ -66,7 +66,8 @@ def single_keys(descriptor: int) -> Iterator[int]:
         tty.setcbreak(descriptor, termios.TCSANOW)
         yield descriptor
     finally:
-        termios.tcsetattr(descriptor, termios.TCSANOW, before)
+        with suppress(termios.error):  # it may be gone
+            termios.tcsetattr(descriptor, termios.TCSANOW, before)
 
 
 class Teleop:

@@ -376,8 +376,7 @@ class Driver:
         try:
             robot = self._watched()
             back_off(robot, self._config.robot, heading_rad)
-            if self._config.robot.kind != "sim":  # it still moves when told to stop
-                robot.run(self._config.robot.hardware.rest_s, stop_on_contact=False)
+            self._rest(robot)
             self.recoveries += 1
         except Halted:  # it stands where it was stopped; the operator's `clear` tells the actor
             pass
@@ -391,9 +390,20 @@ class Driver:
         if direction is None:
             return
         self.state = "recovering"
-        with suppress(Halted):
-            let_go(self._watched(), self._config.robot, direction)
+        robot = self._watched()
+        try:
+            let_go(robot, self._config.robot, direction)
+            self._rest(robot)
+        except Halted:
+            pass
+        except NotReady:  # as in a recovery
+            self.halt()
         self._moving = False
+
+    def _rest(self, robot: WatchedRobot) -> None:
+        """A real robot still moves when it is told to stop."""
+        if self._config.robot.kind != "sim":
+            robot.run(self._config.robot.hardware.rest_s, stop_on_contact=False)
 
     def _watched(self) -> WatchedRobot:
         slice_s = SLICE_S if self._realtime else None

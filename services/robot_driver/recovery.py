@@ -58,7 +58,7 @@ class WatchedRobot:
 
 RELEASE_M = 0.05
 """Way driven regardless of the bumper, to let go of the wall that pressed it."""
-LET_GO_M = 0.1
+LET_GO_M = 0.15
 """Farthest way back out of the contact that a motion by hand ended in."""
 
 

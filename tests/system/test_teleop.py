@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -100,13 +101,13 @@ def test_keys_place_the_robot(robot: dict[str, object], run_name: str, tmp_path:
         start = eyes.look()
         with terminal(cluster, tmp_path) as person:
 
-            def moves(key: str) -> bool:
-                before = eyes.place()
+            def moves(key: str, before: tuple[float, float, float]) -> bool:
                 person.press(key)
                 return eyes.place() != before
 
             for key in ("w", "\x1b[B", "a", "\x1b[C"):
-                cluster.wait(lambda key=key: moves(key), DEADLINE_S, f"{key!r} moves")  # type: ignore[misc]
+                here = eyes.place()
+                cluster.wait(partial(moves, key, here), DEADLINE_S, f"{key!r} moves")
                 cluster.wait(eyes.stands, DEADLINE_S, f"it stands after {key!r}")
             assert eyes.look().sequence == start.sequence  # no action was driven
             person.press("e")
