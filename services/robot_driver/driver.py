@@ -7,8 +7,8 @@ sequence numbers, bumps, recovery and limits are decided here.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, Literal
 
 from services.robot_driver.changes import Changes, Outcome, described
@@ -370,41 +370,34 @@ class Driver:
 
     def _recover(self) -> None:
         """Back off by real motion and turn to a random heading drawn from the seed (E11)."""
-        self.state = "recovering"
         draw = generator(self._config.run.seed, "recovery", self._config.robot.id, self.sequence)
         heading_rad = float(draw.uniform(-math.pi, math.pi))
-        try:
-            robot = self._watched()
+        with self._recovering() as robot:
             back_off(robot, self._config.robot, heading_rad)
-            self._rest(robot)
             self.recoveries += 1
+
+    def _let_go(self, motion: Motion) -> None:
+        """After contact in a straight motion: back the way it came until the bumper is free."""
+        direction = {"forward": -1.0, "back": 1.0}.get(motion)
+        if direction is not None:
+            with self._recovering() as robot:
+                let_go(robot, self._config.robot, direction)
+
+    @contextmanager
+    def _recovering(self) -> Iterator[WatchedRobot]:
+        """A robot that moves by itself, within the limits and watched, until the block ends.
+
+        The block may break off; the robot stands still after it in any case.
+        """
+        self.state = "recovering"
+        slice_s = SLICE_S if self._realtime else None
+        robot = WatchedRobot(self._robot, self.safety, self.watch, slice_s)
+        try:
+            yield robot
+            if self._config.robot.kind != "sim":  # it still moves when told to stop
+                robot.run(self._config.robot.hardware.rest_s, stop_on_contact=False)
         except Halted:  # it stands where it was stopped; the operator's `clear` tells the actor
             pass
         except NotReady:  # it stands; the next look tells why, and the actor
             self.halt()
         self._moving = False
-
-    def _let_go(self, motion: Motion) -> None:
-        """After contact in a straight motion: back the way it came until the bumper is free."""
-        direction = {"forward": -1.0, "back": 1.0}.get(motion)
-        if direction is None:
-            return
-        self.state = "recovering"
-        robot = self._watched()
-        try:
-            let_go(robot, self._config.robot, direction)
-            self._rest(robot)
-        except Halted:
-            pass
-        except NotReady:  # as in a recovery
-            self.halt()
-        self._moving = False
-
-    def _rest(self, robot: WatchedRobot) -> None:
-        """A real robot still moves when it is told to stop."""
-        if self._config.robot.kind != "sim":
-            robot.run(self._config.robot.hardware.rest_s, stop_on_contact=False)
-
-    def _watched(self) -> WatchedRobot:
-        slice_s = SLICE_S if self._realtime else None
-        return WatchedRobot(self._robot, self.safety, self.watch, slice_s)
