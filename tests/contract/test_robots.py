@@ -13,8 +13,9 @@ from waiting import wait_until
 
 from services.robot_driver.driver import Driver
 from services.robot_driver.recovery import WatchedRobot, back_off
-from services.robot_driver.robot import STANDSTILL, Pose, Velocity
+from services.robot_driver.robot import STANDSTILL, NotReady, Pose, Velocity
 from services.robot_driver.safety import Safety
+from shared.messages import Motion
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
 AHEAD = Velocity(SPEED_M_S, 0.0, 0.0)
@@ -177,6 +178,58 @@ def test_a_driver_drives_it(subject: Subject) -> None:
     rest(subject)
     assert way(start, subject.true_pose()) > 0.05
     assert driver.report(0).reason == ""
+
+
+def carry_out(driver: Driver, motion: Motion) -> bool:
+    """One period of a motion, as the service does it; whether it ended in contact."""
+    contact = False
+    try:
+        if driver.start_motion(motion):
+            for _ in range(round(driver._config.robot.period_s / 0.02)):
+                contact = driver.advance(0.02)
+                if contact:
+                    break
+            driver.settle(contact)
+        else:
+            driver.halt()
+            driver.look_again("")
+    except NotReady as problem:  # a stall of this machine
+        driver.block(str(problem))
+        wait_until(driver.fit, 60, "the robot is fit to drive again")
+    return contact
+
+
+def test_it_turns_on_the_spot_and_creeps_into_no_wall(subject: Subject) -> None:
+    driver = Driver(subject.config, subject.robot, "a" * 12)
+    start = subject.true_pose()
+
+    def turned() -> bool:
+        carry_out(driver, "turn-left")
+        heading_rad = subject.true_pose().heading_rad
+        return math.remainder(heading_rad - start.heading_rad, 2.0 * math.pi) > 0.1
+
+    wait_until(turned, 60, "it turns")
+    rest(subject)
+    assert way(start, subject.true_pose()) < 0.03
+    wait_until(lambda: carry_out(driver, "back"), 120, "it meets the wall behind it")
+    driver.halt()
+    rest(subject)
+    seen = driver.observe()
+    assert (seen.sequence, seen.bump, seen.interruption) == (0, True, "moved")
+
+    def free() -> bool:
+        subject.robot.run(0.1, stop_on_contact=False)
+        return not subject.robot.feel().contact
+
+    wait_until(free, 30, "it let go of the wall")
+    before = subject.true_pose()
+
+    def creeps_away() -> bool:
+        assert not carry_out(driver, "forward")
+        return way(before, subject.true_pose()) > 0.05
+
+    wait_until(creeps_away, 60, "it creeps away")
+    rest(subject)
 
 
 def test_closing_stops_it_and_may_happen_twice(subject: Subject) -> None:

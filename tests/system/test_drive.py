@@ -7,7 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from cluster import Cluster, make_config
+from cluster import Cluster, free_port, make_config
+from real_robots import Rig
 from safetensors.torch import load, save
 from waiting import wait_until
 
@@ -32,7 +33,7 @@ def weights_of(config: Config, folder: Path, bias: float) -> Path:
     return path
 
 
-def corridor(cluster: Cluster, *words: object) -> subprocess.Popen[str]:
+def corridor(cluster: Cluster | Rig, *words: object) -> subprocess.Popen[str]:
     """A command beside the cluster."""
     place = ["--endpoint", cluster.config.bus.endpoint, "--run", cluster.config.run.name]
     return subprocess.Popen(
@@ -44,7 +45,7 @@ def corridor(cluster: Cluster, *words: object) -> subprocess.Popen[str]:
     )
 
 
-def drive(cluster: Cluster, weights: Path, *words: object) -> subprocess.Popen[str]:
+def drive(cluster: Cluster | Rig, weights: Path, *words: object) -> subprocess.Popen[str]:
     filters = f"network.filters={cluster.config.network.filters}"
     return corridor(cluster, "drive", "--weights", weights, "--set", filters, *words)
 
@@ -110,3 +111,40 @@ def test_it_turns_on_the_spot_where_it_predicts_nothing_good(
         assert {(o.x_m, o.y_m) for o in turned} <= {(before.x_m, before.y_m)}
         assert len({o.heading_rad for o in looks[2:]}) == 1  # it stands
         cluster.stop("driver", "router")
+
+
+def test_it_drives_and_turns_a_real_robot(tmp_path: Path) -> None:
+    config = Config.model_validate(
+        {
+            "run": {"name": "real"},
+            "bus": {"endpoint": f"tcp/127.0.0.1:{free_port()}"},
+            "network": {"filters": 8},
+            "robot": {
+                "kind": "robotino",
+                "timing": "realtime",
+                "period_s": 0.5,
+                "deadman_s": 1.0,
+                "speed_m_s": 0.15,
+                "turn_rad_s": 0.75,
+                "hardware": {"open_timeout_s": 60.0},
+            },
+        }
+    )
+    with Rig(config, tmp_path / "run") as rig:
+        rig.start("router", "driver")
+        before = heard(rig.bus)[0]
+        with drive(rig, weights_of(config, tmp_path, 0.5), "--actions", 4) as process:
+            said, _ = process.communicate(timeout=DEADLINE_S)
+        assert process.returncode == 0, said
+        after = heard(rig.bus)[-1]
+        assert after.sequence >= before.sequence + 4
+        assert (after.x_m, after.y_m) != (before.x_m, before.y_m)
+        with drive(rig, weights_of(config, tmp_path, -0.5)) as process:
+            rig.wait(
+                lambda: any(abs(o.heading_rad - after.heading_rad) > 0.3 for o in heard(rig.bus)),
+                "it turns on the spot",
+            )
+            process.kill()  # no farewell: the driver sees to it
+            process.communicate(timeout=DEADLINE_S)
+        rig.wait(lambda: rig.truth()["still_since_s"] is not None, "it stands")
+        rig.stop("driver")
