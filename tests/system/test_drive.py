@@ -107,9 +107,10 @@ def test_it_turns_on_the_spot_where_it_predicts_nothing_good(
             said, _ = process.communicate(timeout=DEADLINE_S)
         assert process.returncode == 0, said
         assert all(a.action is None and a.motion in ("turn-left", "turn-right") for a in asked)
-        looks = heard(cluster.bus)
         assert {(o.x_m, o.y_m) for o in turned} <= {(before.x_m, before.y_m)}
-        assert len({o.heading_rad for o in looks[2:]}) == 1  # it stands
+        cluster.wait(
+            lambda: len({o.heading_rad for o in heard(cluster.bus)}) == 1, DEADLINE_S, "it stands"
+        )
         cluster.stop("driver", "router")
 
 
