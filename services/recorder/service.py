@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from services.recorder.recording import RECORDED, Origin, RecordingWriter
 from shared.config import ActorNumerics, Config
 from shared.errors import ConfigError, StateError
-from shared.service import TICK_S, Service, Stopped, service
+from shared.service import EXIT_CRASH, TICK_S, Service, Stopped, service
 from shared.weights import WeightsFetcher
 
 FLUSH_S = 1.0
@@ -46,7 +46,8 @@ def run(
             echo(f"recording run {config.run.name!r} to {path}; Ctrl-C ends it")
             Recorder(me, writer, limit_mib * MIB, echo).run()
     except Stopped:
-        pass
+        echo(f"nothing recorded: stopped while there was no router at {config.bus.endpoint}")
+        return EXIT_CRASH
     return 0
 
 
