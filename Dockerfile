@@ -2,99 +2,119 @@
 #
 #   docker build --target actor --tag corridor-actor .
 #
-# Targets: router, driver (simulation, without torch), actor (without pybullet), replay, learner.
-# docker-compose.yml builds all of them.
+# Targets: router; driver-sim (simulated robot), driver-robotino and driver-ros2 (real robots, without
+# simulator); actor, replay, learner. Drivers have no torch. docker-compose.yml builds all of them.
 #
-# BASE_IMAGE needs Python 3.11 with venv. TORCH_INDEX_URL: one of PyTorch's own package indexes, to
-# choose a CPU-only build (much smaller images) or a CUDA build; empty takes the usual one.
+# BASE_IMAGE needs Python 3.11 with venv (deploy/make-base-image.sh makes one from Debian packages).
+# TORCH_INDEX_URL: one of PyTorch's own package indexes, to choose a CPU-only build (much smaller
+# images) or a CUDA build; empty takes the usual one. PIP_INDEX_URL: another package index.
 ARG BASE_IMAGE=python:3.11-slim-bookworm
 
-# ------------------------------------------------ virtual environments: dependencies before code
+# ------------------------------------------------ libraries; images share the layers they can
 
 FROM ${BASE_IMAGE} AS base
-ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1
+RUN useradd --uid 10001 --create-home corridor && \
+    install --directory --owner corridor --group corridor /data
+ENV PATH=/opt/venv/bin:$PATH PYTHONUNBUFFERED=1 PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1
 RUN python3 -m venv /opt/venv
-ENV PATH=/opt/venv/bin:$PATH
 WORKDIR /src
 # As much as pip needs to resolve dependencies: a change of the code keeps the layers below.
 COPY pyproject.toml constraints.txt LICENSE ./
+ARG PIP_INDEX_URL=
 RUN touch README.md && pip install --constraint constraints.txt .
 
+# ------------------------------------------------ our code, as pip lays it out
+
 FROM base AS code
+ARG PIP_INDEX_URL=
 COPY README.md ./
 COPY shared shared
 COPY services services
 COPY experiments experiments
-RUN pip wheel --no-deps --wheel-dir /wheels .
+RUN pip install --no-deps --ignore-installed --prefix /code .
 
-FROM base AS router-env
-COPY --from=code /wheels /wheels
-RUN pip install --no-deps --force-reinstall /wheels/*.whl
+# ------------------------------------------------ images: an unprivileged user, state below /data
 
-FROM base AS driver-env
+FROM base AS router
+COPY --from=code /code /opt/venv
+USER corridor
+# Run folders are /data/runs/<run name>.
+WORKDIR /data
+ENTRYPOINT ["corridor"]
+HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
+    CMD ["python", "-m", "services.monitor.health", "router"]
+CMD ["router", "--listen", "tcp/0.0.0.0:7447"]
+
+FROM base AS driver-sim
+ARG PIP_INDEX_URL=
 RUN pip install --constraint constraints.txt '.[sim]'
-COPY --from=code /wheels /wheels
-RUN pip install --no-deps --force-reinstall /wheels/*.whl
+COPY --from=code /code /opt/venv
+USER corridor
+WORKDIR /data
+ENTRYPOINT ["corridor"]
+HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
+    CMD ["python", "-m", "services.monitor.health", "driver"]
+CMD ["driver"]
+
+FROM base AS driver-robotino
+ARG PIP_INDEX_URL=
+RUN pip install --constraint constraints.txt '.[robotino]'
+COPY --from=code /code /opt/venv
+USER corridor
+WORKDIR /data
+ENTRYPOINT ["corridor"]
+HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
+    CMD ["python", "-m", "services.monitor.health", "driver"]
+CMD ["driver"]
+
+FROM base AS driver-ros2
+ARG PIP_INDEX_URL=
+RUN pip install --constraint constraints.txt '.[ros2]'
+COPY --from=code /code /opt/venv
+USER corridor
+WORKDIR /data
+ENTRYPOINT ["corridor"]
+HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
+    CMD ["python", "-m", "services.monitor.health", "driver"]
+CMD ["driver"]
 
 FROM base AS torch
+ARG PIP_INDEX_URL=
 ARG TORCH_INDEX_URL=
 RUN if [ -n "$TORCH_INDEX_URL" ]; then \
       pip install --constraint constraints.txt --no-deps --index-url "$TORCH_INDEX_URL" torch; \
     fi && \
     pip install --constraint constraints.txt '.[actor]'
 
-FROM torch AS actor-env
+FROM torch AS actor
+ARG PIP_INDEX_URL=
 RUN pip install --constraint constraints.txt '.[actor,openvino]'
-COPY --from=code /wheels /wheels
-RUN pip install --no-deps --force-reinstall /wheels/*.whl
-
-FROM torch AS replay-env
-RUN pip install --constraint constraints.txt '.[replay,openvino]'
-COPY --from=code /wheels /wheels
-RUN pip install --no-deps --force-reinstall /wheels/*.whl
-
-FROM torch AS learner-env
-RUN pip install --constraint constraints.txt '.[learner]'
-COPY --from=code /wheels /wheels
-RUN pip install --no-deps --force-reinstall /wheels/*.whl
-
-# ------------------------------------------------ images: an unprivileged user, state below /data
-
-FROM ${BASE_IMAGE} AS runtime
-RUN useradd --uid 10001 --create-home corridor && \
-    install --directory --owner corridor --group corridor /data
-ENV PATH=/opt/venv/bin:$PATH PYTHONUNBUFFERED=1
+COPY --from=code /code /opt/venv
 USER corridor
-# Run folders are /data/runs/<run name>.
 WORKDIR /data
 ENTRYPOINT ["corridor"]
-
-FROM runtime AS router
-COPY --from=router-env /opt/venv /opt/venv
-HEALTHCHECK --interval=15s --timeout=10s --start-period=20s --retries=3 \
-    CMD ["python", "-m", "services.monitor.health", "router"]
-CMD ["router", "--listen", "tcp/0.0.0.0:7447"]
-
-FROM runtime AS driver
-COPY --from=driver-env /opt/venv /opt/venv
-HEALTHCHECK --interval=15s --timeout=10s --start-period=20s --retries=3 \
-    CMD ["python", "-m", "services.monitor.health", "driver"]
-CMD ["driver"]
-
-FROM runtime AS actor
-COPY --from=actor-env /opt/venv /opt/venv
-HEALTHCHECK --interval=15s --timeout=10s --start-period=20s --retries=3 \
+HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
     CMD ["python", "-m", "services.monitor.health", "actor"]
 CMD ["actor"]
 
-FROM runtime AS replay
-COPY --from=replay-env /opt/venv /opt/venv
-HEALTHCHECK --interval=15s --timeout=10s --start-period=20s --retries=3 \
+FROM torch AS replay
+ARG PIP_INDEX_URL=
+RUN pip install --constraint constraints.txt '.[replay,openvino]'
+COPY --from=code /code /opt/venv
+USER corridor
+WORKDIR /data
+ENTRYPOINT ["corridor"]
+HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
     CMD ["python", "-m", "services.monitor.health", "replay"]
 CMD ["replay"]
 
-FROM runtime AS learner
-COPY --from=learner-env /opt/venv /opt/venv
-HEALTHCHECK --interval=15s --timeout=10s --start-period=20s --retries=3 \
+FROM torch AS learner
+ARG PIP_INDEX_URL=
+RUN pip install --constraint constraints.txt '.[learner]'
+COPY --from=code /code /opt/venv
+USER corridor
+WORKDIR /data
+ENTRYPOINT ["corridor"]
+HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
     CMD ["python", "-m", "services.monitor.health", "learner"]
 CMD ["learner"]
