@@ -17,12 +17,12 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-full check lint unit system bench profile bench-full bench-peers clean
+.PHONY: help setup demo test test-full check lint unit system compose-test bench profile bench-full bench-peers clean
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
 
 help: ## show this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 setup: $(VENV)/.dev ## make the virtual environment with everything in it
 
@@ -49,6 +49,9 @@ unit: $(VENV)/.dev ## fast tests, two at a time
 # Real processes wait for each other: one test at a time.
 system: $(VENV)/.dev ## tests with real processes and a real router, without the slow ones
 	$(PYTEST) -m "not slow" tests/system tests/learning
+
+compose-test: $(VENV)/.made ## images and containers, with kills; needs a Docker engine (docs/compose.md)
+	$(BIN)/python tests/compose/trial.py $(ARGS)
 
 bench: $(VENV)/.dev ## measure speed and memory, in minutes; the machine should do nothing else
 	$(BIN)/python -m benchmarks.run_all --short

@@ -29,12 +29,16 @@ cleanup() {
 trap cleanup EXIT
 cp pyproject.toml LICENSE "$project"
 touch "$project/README.md"
-echo "fetching wheels into build/wheels"
 mkdir -p build/wheels build/index
 extras=sim,robotino,ros2,actor,replay,learner,openvino
-"$python" -m pip wheel --quiet --wheel-dir build/wheels --find-links build/wheels \
-  --constraint constraints.txt "$project[$extras]" 'setuptools>=77'
-rm -f build/wheels/corridor-*.whl  # of the copy
+wanted=$(cat pyproject.toml constraints.txt | sha256sum)
+if [ "$(cat build/wheels/of 2>/dev/null)" != "$wanted" ]; then
+  echo "fetching wheels into build/wheels"
+  "$python" -m pip wheel --quiet --wheel-dir build/wheels --find-links build/wheels \
+    --constraint constraints.txt "$project[$extras]" 'setuptools>=77'
+  rm -f build/wheels/corridor-*.whl  # of the copy
+  echo "$wanted" >build/wheels/of
+fi
 
 "$python" - <<'END'
 """One folder a project, as package indexes are laid out, with nothing but what is pinned now."""

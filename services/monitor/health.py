@@ -1,8 +1,10 @@
 """Health check of one service, for containers: `python -m services.monitor.health replay`.
 
-Healthy means: the service answers a ping, and its heartbeat, which its working thread sends, comes
-as well. An actor without robots has no heartbeat, so for actors the ping alone counts. The router
-is healthy when it accepts a session.
+Healthy means doing its job: the service answers a ping, and its heartbeat, which its working thread
+sends, comes as well. What it does now is told in one line: a driver whose robot stands still since
+a sensor is silent is healthy, and says so; restarting it would help nobody. An actor has heartbeats
+only for robots that send observations, so without such robots the ping alone counts. The router is
+healthy when it accepts a session.
 """
 
 from __future__ import annotations
@@ -11,69 +13,91 @@ import os
 import sys
 import time
 
+from services.monitor.heartbeats import Reader, Snapshot
+from services.monitor.live import learner_doing, replay_doing
 from shared import settings
 from shared.bus import Bus
 from shared.config import Config
 from shared.errors import BadMessage, BusError, ConfigError
-from shared.keys import LEARNER_STATE, REPLAY_STATE, ROBOT_STATE, SERVICE, Stream
-from shared.messages import (
-    LearnerState,
-    Message,
-    ReplayState,
-    RobotState,
-    ServiceCommand,
-    ServiceReply,
-)
+from shared.keys import SERVICE
+from shared.messages import ServiceCommand, ServiceReply
 
 SERVICES = ("router", "driver", "actor", "replay", "learner")
-HEARTBEATS: dict[str, tuple[Stream, type[Message]]] = {
-    "driver": (ROBOT_STATE, RobotState),
-    "replay": (REPLAY_STATE, ReplayState),
-    "learner": (LEARNER_STATE, LearnerState),
-}
 PERIODS = 3
 """Heartbeat periods after which silence counts as sick."""
+OBSERVING = {"waiting", "driving", "recovering"}
+"""States of a robot in which its driver sends observations and so needs an actor."""
 
 
-def problem(name: str, config: Config) -> str:
-    """Why the service is not healthy, in one line; empty if it is."""
+class Sick(Exception):
+    """Why a service is not healthy, in one line."""
+
+
+def check(name: str, config: Config) -> str:
+    """What the service does now, in one line.
+
+    Args:
+        name: one of `SERVICES`; the driver is that of `robot.id`.
+        config: how to reach the run.
+
+    Raises:
+        Sick: it does not do its job.
+    """
     if name not in SERVICES:
-        return f"expected one of {', '.join(SERVICES)}, got {name!r}"
+        raise Sick(f"expected one of {', '.join(SERVICES)}, got {name!r}")
     try:
         with Bus(config.bus, config.run.name) as bus:
-            return "" if name == "router" else _sickness(bus, name, config)
+            return "accepts sessions" if name == "router" else _doing(bus, name, config)
     except (BusError, BadMessage) as error:
-        return str(error)
+        raise Sick(str(error)) from error
 
 
-def _sickness(bus: Bus, name: str, config: Config) -> str:
+def _doing(bus: Bus, name: str, config: Config) -> str:
     """Ping the service and wait for its heartbeat. Raises BusError when it does not answer."""
     ident = config.robot.id if name == "driver" else "main"
     inbox = bus.inbox()
-    if name in HEARTBEATS:
-        inbox.subscribe(HEARTBEATS[name][0], ident)
+    reader = Reader(inbox)
     bus.request(SERVICE, ServiceCommand(command="ping"), ServiceReply, ident=f"{name}-{ident}")
-    if name not in HEARTBEATS:
-        return ""
     deadline_s = time.monotonic() + PERIODS * config.bus.heartbeat_s
     while time.monotonic() < deadline_s:
         inbox.wait(0.1)
-        if inbox.take(*HEARTBEATS[name]):
-            return ""
-    return f"{name} {ident}: answers, but sent no heartbeat for {PERIODS} periods"
+        reader.update()
+        if told := _told(name, ident, reader.snapshot()):
+            return told
+    if name == "actor" and not _needs_actor(reader.snapshot()):
+        return "waits for a robot"
+    raise Sick(f"{name} {ident}: answers, but sent no heartbeat for {PERIODS} periods")
+
+
+def _told(name: str, ident: str, seen: Snapshot) -> str:
+    """What the service's heartbeat says; empty while there is none."""
+    if name == "driver" and ident in seen.robots:
+        robot = seen.robots[ident].message
+        return f"{robot.state}, {robot.reason}" if robot.reason else robot.state
+    if name == "actor" and seen.actors:
+        actors = (entry.message for entry in seen.actors.values())
+        return ", ".join(f"{actor.phase} for {actor.robot}" for actor in actors)
+    if name == "replay" and seen.replay:
+        return f"{replay_doing(seen.replay.message)}, episode {seen.replay.message.episode}"
+    if name == "learner" and seen.learner:
+        return f"{learner_doing(seen.learner.message)}, episode {seen.learner.message.episode}"
+    return ""
+
+
+def _needs_actor(seen: Snapshot) -> bool:
+    """Whether a robot sends observations, so that a working actor would send heartbeats."""
+    return any(robot.message.state in OBSERVING for robot in seen.robots.values())
 
 
 def main(arguments: list[str]) -> int:
-    """Check the named service as the environment says; 0 healthy, 1 not, with one line."""
+    """Check the named service as the environment says; 0 healthy, 1 not, each with one line."""
     try:
         config = settings.load(env=os.environ)
-    except ConfigError as error:
+        sys.stdout.write(f"{check(arguments[0] if arguments else '', config)}\n")
+    except (ConfigError, Sick) as error:
         sys.stderr.write(f"{error}\n")
         return 1
-    trouble = problem(arguments[0] if arguments else "", config)
-    if trouble:
-        sys.stderr.write(f"{trouble}\n")
-    return 1 if trouble else 0
+    return 0
 
 
 if __name__ == "__main__":

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from typing import Any
 
-import cv2
 import numpy as np
+from PIL import Image
 
 from services.robot_driver.link import Battery
 from services.robot_driver.robot import Pose
@@ -77,12 +78,13 @@ def camera(body: bytes) -> ImageArray:
     width, height = jpeg_size(body)
     if _END not in body[-_TAIL:]:  # it cannot stand inside the compressed picture
         raise BadReply("truncated")
-    large = width >= 4 * WIDTH and height >= 4 * HEIGHT
-    flag = cv2.IMREAD_REDUCED_COLOR_2 if large else cv2.IMREAD_COLOR
-    frame = cv2.imdecode(np.frombuffer(body, np.uint8), flag)
-    if frame is None:
-        raise BadReply("not a JPEG")
-    return preprocess(np.ascontiguousarray(frame[:, :, ::-1], np.uint8))
+    try:
+        with Image.open(io.BytesIO(body), formats=["JPEG"]) as picture:
+            if width >= 4 * WIDTH and height >= 4 * HEIGHT:  # decoding half as large is quicker
+                picture.draft("RGB", (width // 2, height // 2))
+            return preprocess(np.asarray(picture.convert("RGB"), np.uint8))
+    except (OSError, SyntaxError, ValueError) as error:  # what Pillow says of broken files
+        raise BadReply("not a JPEG") from error
 
 
 def jpeg_size(body: bytes) -> tuple[int, int]:

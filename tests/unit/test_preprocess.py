@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 from shared.messages import IMAGE_SHAPE
 from shared.rl.preprocess import PREPROCESS_VERSION, preprocess
 
+HALF = Fraction(1, 2)
+
 
 def random_frame(height: int, width: int, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), np.uint8)
@@ -31,24 +33,33 @@ def coverage(source: int, target: int) -> list[list[tuple[int, Fraction]]]:
     return cells
 
 
-def naive_pixel(frame: np.ndarray, row: list, column: list) -> float:
+def naive_pixel(frame: np.ndarray, row: list, column: list) -> int:
+    """One pixel in exact arithmetic, each of the two steps rounded half up."""
     mean = [
-        sum(int(frame[y, x, c]) * wy * wx for y, wy in row for x, wx in column) for c in range(3)
+        floor(sum(int(frame[y, x, c]) * wy * wx for y, wy in row for x, wx in column) + HALF)
+        for c in range(3)
     ]
-    return float(
-        Fraction(299, 1000) * mean[0]
-        + Fraction(587, 1000) * mean[1]
-        + Fraction(114, 1000) * mean[2]
-    )
+    return floor(Fraction(4899 * mean[0] + 9617 * mean[1] + 1868 * mean[2], 2**14) + HALF)
 
 
-def test_a_camera_frame_matches_area_means_in_exact_arithmetic():
-    frame = random_frame(720, 1280, 1)
+@pytest.mark.parametrize("size", [(720, 1280), (600, 800), (480, 641), (100, 150), (7, 5), (1, 1)])
+def test_a_frame_becomes_area_means_in_exact_arithmetic(size: tuple[int, int]):
+    frame = random_frame(*size, 1)
     image = preprocess(frame)
-    rows, columns = coverage(720, 50), coverage(1280, 75)
+    rows, columns = coverage(size[0], 50), coverage(size[1], 75)
     for y, x in ((0, 0), (0, 74), (49, 0), (49, 74), (25, 37), (13, 61)):
-        # half a level from each of the two roundings
-        assert abs(int(image[y, x]) - naive_pixel(frame, rows[y], columns[x])) <= 1.0
+        assert int(image[y, x]) == naive_pixel(frame, rows[y], columns[x])
+
+
+def test_the_largest_picture_does_not_overflow():
+    assert np.all(preprocess(np.full((4096, 4096, 3), 255, np.uint8)) == 255)
+
+
+def test_it_agrees_with_the_area_resize_of_opencv():
+    cv2 = pytest.importorskip("cv2")
+    frame = random_frame(600, 800, 3)
+    theirs = cv2.resize(frame, (75, 50), interpolation=cv2.INTER_AREA)
+    assert np.abs(preprocess(frame).astype(int) - preprocess(theirs)).max() <= 1
 
 
 def test_a_frame_of_the_right_size_is_only_turned_grey_rounding_half_up():
@@ -87,12 +98,12 @@ def test_pixels_of_this_version_never_change():
     y, x, c = np.mgrid[0:90, 0:160, 0:3]
     frame = ((7 * y + 3 * x + 50 * c) % 256).astype(np.uint8)
     image = preprocess(frame)
-    assert PREPROCESS_VERSION == 1
+    assert PREPROCESS_VERSION == 2
     assert int(image.sum(dtype=np.int64)) == GOLDEN_SUM
     assert image[10, ::15].tolist() == GOLDEN_ROW
 
 
-GOLDEN_SUM = 480346
+GOLDEN_SUM = 480362
 GOLDEN_ROW = [172, 88, 108, 175, 64]
 
 
