@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 from cluster import Cluster, free_port, make_config
-from real_robots import Rig
 from safetensors.torch import load, save
 from waiting import wait_until
 
+from benchmarks.robot_rig import Rig
 from shared.bus import Bus
 from shared.config import Config
 from shared.keys import ACTION, OBSERVATION
