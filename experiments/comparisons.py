@@ -146,7 +146,10 @@ def _together(group: str, shown: Sequence[Experiment]) -> list[Block]:
     scale = shown[0].scale
     blocks: list[Block] = []
     for world in sorted(set.intersection(*(set(e.worlds) for e in shown))):
-        caption = "Greedy drives without learning; bands: lowest to highest seed."
+        caption = (
+            "Greedy drives without learning; bands: lowest to highest seed; thin lines: single "
+            "seeds."
+        )
         drawn = partial(evaluation.curves, shown, world)
         title = f"Frozen evaluation in {world}, {', '.join(e.name for e in shown)}"
         name = f"{scale}-evaluation-{group}-in-{world}"

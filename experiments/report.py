@@ -241,8 +241,8 @@ def _evaluations(experiment: Experiment) -> list[Block]:
     for world in experiment.worlds:
         caption = (
             f"Greedy drives of the frozen network in {world}, without learning. "
-            f"{_seeds_text(experiment)} Lines across: random actions and the planner that knows "
-            "the map, where they drove."
+            f"{_seeds_text(experiment)} Thin lines: single seeds. Lines across: random actions and "
+            "the planner that knows the map, where they drove."
         )
         title = f"Frozen evaluation in {world}"
         drawn = partial(evaluation.curves, [experiment], world)

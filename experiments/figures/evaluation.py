@@ -57,11 +57,18 @@ def panels(experiments: Sequence[Experiment], world: str) -> tuple[Panel, Panel,
     return BUMPS, around, DISTANCE
 
 
-def evaluation_band(experiment: Experiment, world: str, panel: Panel) -> Band | None:
-    """One figure of all seeds over the actions driven while learning; None without drives."""
+def evaluation_curves(
+    experiment: Experiment, world: str, panel: Panel
+) -> list[tuple[Floats, Floats]]:
+    """One figure of every seed that drove over the actions driven while learning."""
     rows = [run.evaluated(world) for run in experiment.runs]
-    curves = [(part.numbers("total_actions"), panel.of(part)) for part in rows if len(part)]
-    return band_between([_unique(*curve) for curve in curves]) if curves else None
+    return [_unique(part.numbers("total_actions"), panel.of(part)) for part in rows if len(part)]
+
+
+def evaluation_band(experiment: Experiment, world: str, panel: Panel) -> Band | None:
+    """The same of all seeds together, where all of them drove; None without drives."""
+    curves = evaluation_curves(experiment, world, panel)
+    return band_between(curves) if curves else None
 
 
 def _unique(x: Floats, y: Floats) -> tuple[Floats, Floats]:
@@ -89,6 +96,9 @@ def curves(experiments: Sequence[Experiment], world: str) -> Figure:
     row = figure.subplots(1, 3)
     for panel, axes in zip(panels(experiments, world), row, strict=True):
         for experiment in experiments:
+            # Seeds drive different numbers of actions: single ones go on beyond the band.
+            for curve in evaluation_curves(experiment, world, panel):
+                axes.plot(*curve, color=named[experiment.name], linewidth=0.7, alpha=0.6)
             band = evaluation_band(experiment, world, panel)
             if band is not None:
                 draw_band(axes, band, named[experiment.name], experiment.name)

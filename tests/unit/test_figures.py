@@ -108,8 +108,17 @@ def test_only_a_sure_difference_is_filled() -> None:
 
 def test_floor_and_ceiling_are_lines_across(found: dict[str, Experiment]) -> None:
     axes = evaluation.curves([found["plus-rmm"]], "plus").axes[0]
-    across = {line.get_label(): float(np.asarray(line.get_ydata())[0]) for line in axes.lines[1:]}
+    lines = {str(line.get_label()): np.asarray(line.get_ydata()) for line in axes.lines}
+    across = {name: float(lines[name][0]) for name in ("random", "planner")}
     assert across == {"random": 75.0, "planner": 0.5}
+
+
+def test_every_seed_has_a_line_to_its_own_end(found: dict[str, Experiment]) -> None:
+    experiment = found["plus-rmm"]
+    axes = evaluation.curves([experiment], "plus").axes[0]
+    ends = [float(np.asarray(line.get_xdata())[-1]) for line in axes.lines]
+    for run in experiment.runs:
+        assert run.evaluated("plus").numbers("total_actions")[-1] in ends
 
 
 def test_equal_figures_are_equal_bytes(found: dict[str, Experiment]) -> None:
