@@ -26,6 +26,8 @@ DPI = 150
 SCALE_M = 2
 EVENT_GAP_PT = 13
 """Distance of an event's number from its place, so that the way stays visible."""
+EVENTS_APART_M = 0.7
+"""Events closer to each other share a label."""
 _FREE, _SOLID, _INK, _BOX = "#f7f6f2", "#cececa", "#282c34", "#a9825a"
 _BUMP, _START, _END = "#d55e00", "#009e73", "#282c34"
 _WAY = "#0072b2"
@@ -137,14 +139,37 @@ def figure(
 
 
 def _mark(axes: Axes, trace: Trace, events: Sequence[Event]) -> None:
-    for event in events:
-        x, y = trace.places_m[min(event.action, len(trace.bumps))]
+    for (x, y), numbers in gathered(trace, events):
         axes.annotate(
-            str(event.number), (float(x), float(y)), textcoords="offset points",
-            xytext=(EVENT_GAP_PT, EVENT_GAP_PT), ha="center", va="center", fontsize=9, zorder=5,
+            ranges(numbers), (x, y), textcoords="offset points",
+            xytext=(EVENT_GAP_PT, EVENT_GAP_PT), ha="center", va="center", fontsize=8, zorder=5,
             arrowprops={"arrowstyle": "-", "color": _INK, "shrinkB": 0},
-            bbox={"boxstyle": "circle,pad=0.25", "facecolor": "white", "edgecolor": _INK},
+            bbox={"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": _INK},
         )  # fmt: skip
+
+
+def gathered(trace: Trace, events: Sequence[Event]) -> list[tuple[tuple[float, float], list[int]]]:
+    """Places of events in metres with the numbers of all that happened close by."""
+    groups: list[tuple[tuple[float, float], list[int]]] = []
+    for event in events:
+        x, y = (float(part) for part in trace.places_m[min(event.action, len(trace.bumps))])
+        near = [n for (gx, gy), n in groups if np.hypot(gx - x, gy - y) <= EVENTS_APART_M]
+        if near:
+            near[0].append(event.number)
+        else:
+            groups.append(((x, y), [event.number]))
+    return groups
+
+
+def ranges(numbers: Sequence[int]) -> str:
+    """Ascending numbers, neighbours as one: "3, 5-7"."""
+    parts: list[list[int]] = []
+    for number in numbers:
+        if parts and number == parts[-1][-1] + 1:
+            parts[-1] = [parts[-1][0], number]
+        else:
+            parts.append([number])
+    return ", ".join("-".join(map(str, part)) for part in parts)
 
 
 def bump_places(trace: Trace) -> npt.NDArray[np.float64]:

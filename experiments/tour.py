@@ -24,7 +24,7 @@ from shared.rl.draws import generator
 from shared.rl.policy import choose
 from shared.rl.spot_turns import SpotTurns
 
-DRIVEN, MOST_DRIVEN = 300, 600
+DRIVEN, MOST_DRIVEN = 300, 1200
 """Actions of a full tour at least, turns on the spot not counted, and of one that is given up."""
 ROUTE_SHARE, BRIDGES = 0.6, 2
 """Of the route's length, and how many bridges, a full tour comes along."""
@@ -35,6 +35,8 @@ BEYOND_BOX = 30
 NEAR_M = 1.0
 """A place is passed within this distance."""
 BOX_AHEAD_M = 1.1
+ONE_TURN = 5
+"""Turns on the spot with no more driven actions between them are told as one event."""
 
 ROLE = "tour"
 
@@ -94,7 +96,13 @@ class _Log:
         self.driven.append(driven)
 
 
-def drive_tour(env: CorridorEnv, network: Predicts, pose: Pose, number: int) -> Tour:
+def drive_tour(
+    env: CorridorEnv,
+    network: Predicts,
+    pose: Pose,
+    number: int,
+    most_driven: int = MOST_DRIVEN,
+) -> Tour:
     """One test drive from a pose, in a world with a route: until it is full, or given up.
 
     Args:
@@ -102,6 +110,8 @@ def drive_tour(env: CorridorEnv, network: Predicts, pose: Pose, number: int) -> 
         network: Frozen.
         pose: Where to begin, standing.
         number: Seeds draws between equal predictions, and recoveries.
+        most_driven: Driven actions after which a tour that is not full is given up; it is too
+            after four times as many with the turns on the spot.
 
     Raises:
         ValueError: The world has no route, or the pose is inside a wall.
@@ -113,8 +123,9 @@ def drive_tour(env: CorridorEnv, network: Predicts, pose: Pose, number: int) -> 
     log = _Log([(pose.x_m, pose.y_m, pose.heading_rad)])
     dropped, dropped_at = False, 0
     draw = generator(number, ROLE)
-    spot_turns, turning = SpotTurns(env.config.robot.turn_rad_s * env.config.robot.period_s), False
-    while (driven := sum(log.driven)) < MOST_DRIVEN and len(log.bumps) < 4 * MOST_DRIVEN:
+    spot_turns = SpotTurns(env.config.robot.turn_rad_s * env.config.robot.period_s)
+    turned_at = -math.inf
+    while (driven := sum(log.driven)) < most_driven and len(log.bumps) < 4 * most_driven:
         _tell_passed(world, log)
         if dropped and driven >= max(DRIVEN, dropped_at + BEYOND_BOX) and _full(world, log):
             break
@@ -124,13 +135,12 @@ def drive_tour(env: CorridorEnv, network: Predicts, pose: Pose, number: int) -> 
         values = network.all_values(image_array(observation.image)[None])[0]
         action, _ = choose(values, GREEDY, draw)
         if side := spot_turns.decide(values, action):
-            if not turning:
+            if driven > turned_at + ONE_TURN:
                 log.tell(f"turns {side} on the spot")
-            turning = True
+            turned_at = driven
             observation = env.turn(side == "left")
             log.add(env.robot.pose, bump=False, driven=False)
             continue
-        turning = False
         _, _, bumped, _, info = env.step(np.int64(action))
         if bumped:
             _, info = env.reset()

@@ -94,4 +94,18 @@ def test_events_stand_as_numbers_on_the_map() -> None:
     events = (Event(1, 0, "begins"), Event(2, 3, "ends"))
     (axes,) = routes.figure(load_world("plus"), [DRIVE], "Plus", events).axes
     marks = [mark for mark in axes.texts if isinstance(mark, Annotation)]
-    assert [(mark.get_text(), mark.xy) for mark in marks] == [("1", (3.8, 0.0)), ("2", (4.1, 0.1))]
+    assert [(mark.get_text(), mark.xy) for mark in marks] == [("1-2", (3.8, 0.0))]
+
+
+@pytest.mark.parametrize(
+    ("numbers", "text"),
+    [([], ""), ([3], "3"), ([3, 4], "3-4"), ([1, 3, 4, 5, 9], "1, 3-5, 9")],
+)
+def test_neighbouring_numbers_are_told_as_one(numbers: list[int], text: str) -> None:
+    assert routes.ranges(numbers) == text
+
+
+def test_events_close_to_each_other_share_a_label() -> None:
+    far = replace(DRIVE, places_m=np.array([[0.0, 0.0], [0.1, 0.0], [5.0, 0.0], [0.2, 0.0]]))
+    events = [Event(1, 0, ""), Event(2, 1, ""), Event(3, 2, ""), Event(4, 3, "")]
+    assert routes.gathered(far, events) == [((0.0, 0.0), [1, 2, 4]), ((5.0, 0.0), [3])]

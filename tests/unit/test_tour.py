@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experiments.environment import CorridorEnv
-from experiments.tour import BOX_NAME, MOST_DRIVEN, drive_tour, route_share
+from experiments.tour import BOX_NAME, drive_tour, route_share
 from services.robot_driver.robot import Pose
 from services.robot_driver.world import load_world
 from shared.config import Config
@@ -37,6 +37,7 @@ def env() -> Iterator[CorridorEnv]:
 
 
 START = Pose(6.0, 0.0, 0.0)
+MOST = 400
 
 
 @pytest.mark.parametrize(("best", "sense"), [(0, -1.0), (1, 1.0), (2, -1.0)])
@@ -54,27 +55,27 @@ def test_a_negative_prediction_turns_on_the_spot_in_one_direction_until_it_is_no
             return (-0.5, -0.1, -0.5) if sense < 0.0 else (-0.5, -0.5, -0.1)
         return (0.0, -0.5, -0.5)
 
-    tour = drive_tour(env, Scripted(rule), START, 0)
+    tour = drive_tour(env, Scripted(rule), START, 0, MOST)
     headings = np.unwrap(tour.route.trace.headings_rad[:4])
     turn = env.config.robot.turn_rad_s * env.config.robot.period_s
     np.testing.assert_allclose(np.diff(headings), [sense * turn, sense * turn, 0.0], atol=1e-9)
     places = tour.route.trace.places_m
     np.testing.assert_allclose(places[0], places[2])
     assert tour.turned == 2
-    assert tour.driven == MOST_DRIVEN
+    assert tour.driven == MOST
 
 
 def test_a_robot_that_finds_no_way_out_drives_on_after_two_full_turns(env: CorridorEnv) -> None:
-    tour = drive_tour(env, Scripted(lambda _: (-0.1, -0.5, -0.5)), START, 0)
+    tour = drive_tour(env, Scripted(lambda _: (-0.1, -0.5, -0.5)), START, 0, MOST)
     turn = np.rad2deg(env.config.robot.turn_rad_s * env.config.robot.period_s)
     per_drive = int(np.ceil(720.0 / turn))
     assert tour.turned == pytest.approx(per_drive * tour.driven, abs=per_drive)
-    assert len(tour.route.trace.bumps) == 4 * MOST_DRIVEN
+    assert len(tour.route.trace.bumps) == 4 * MOST
     assert not tour.passed
 
 
 def test_bumps_are_counted_and_told_and_the_box_is_taken_away(env: CorridorEnv) -> None:
-    tour = drive_tour(env, Scripted(lambda _: (1.0, 0.0, 0.0)), START, 0)
+    tour = drive_tour(env, Scripted(lambda _: (1.0, 0.0, 0.0)), START, 0, MOST)
     told = [event.text for event in tour.route.events]
     assert tour.bumps == told.count("bumps") > 0
     assert [event.number for event in tour.route.events] == list(range(1, len(told) + 1))
