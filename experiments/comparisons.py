@@ -24,7 +24,8 @@ POLICY = "policy-"
 """Experiments whose name begins so are rows of the table of policies (Fig 4.2)."""
 PROBES_SHOWN = 6
 EXPECTED_BEST_FIRST = (
-    "plus-rmm", "plus-rmm-nopretrain", "plus-normm-fit", "plus-normm-fit-alone", "plus-normm",
+    "plus-rmm", "plus-rmm-nopretrain", "plus-rmm-quotas", "plus-rmm-no-equalisation",
+    "plus-rmm-no-fits", "plus-normm-fit", "plus-normm-fit-alone", "plus-normm",
 )  # fmt: skip
 RETURNING = ("plus-minus", "plus-minus-normm")
 """Go on from Plus to another corridor, and come back."""

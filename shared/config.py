@@ -259,8 +259,8 @@ class MemoryConfig(Section):
     strategy: Literal["rmm", "normm"] = "rmm"
     rule: Literal["paper", "cover"] = "paper"
     """Marking against any newer sample, or only against kept ones (E23)."""
-    threshold_percent: int = Field(default=1, ge=1, le=7)
-    """Similarity threshold at the start; 1 % of 120 bits (A32, E18)."""
+    threshold_percent: int = Field(default=1, ge=1, le=100)
+    """Similarity threshold at the start, % of 120 bits (A32, E18); 100: all are similar."""
     threshold_max_percent: int = Field(default=7, ge=1, le=100)
     recompute_below: int = Field(default=0, ge=0)
     """Fewer candidates of an over-quota action call for new marks; 0: 1000 scaled (A31, E17b)."""

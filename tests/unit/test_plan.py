@@ -101,6 +101,28 @@ def test_only_the_strategy_differs_between_compared_memories(ours: str, beside: 
     assert trees[0] == trees[1]
 
 
+@pytest.mark.parametrize(
+    ("name", "section", "changed"),
+    [
+        ("quotas", "memory", {"threshold_percent": (1, 100), "threshold_max_percent": (3, 100)}),
+        ("no-equalisation", "memory", {"equalise_every": (50, 0)}),
+        ("no-fits", "learning", {"fit_every": (100, 0)}),
+    ],
+)
+def test_rmm_is_taken_apart_one_part_at_a_time(
+    name: str, section: str, changed: dict[str, tuple[int, int]]
+) -> None:
+    whole, apart = (
+        stage_config(load_plan(plan, "full"), 0, 1).to_dict()
+        for plan in ("plus-rmm-nopretrain", f"plus-rmm-{name}")
+    )
+    del whole["run"]["name"], apart["run"]["name"]
+    for key, (before, after) in changed.items():
+        assert whole[section].pop(key) == before
+        assert apart[section].pop(key) == after
+    assert whole == apart
+
+
 @pytest.mark.parametrize("scale", SCALES)
 def test_every_plan_can_be_run_after_its_predecessor(scale: str) -> None:
     for name in plan_names():
