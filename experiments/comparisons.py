@@ -24,9 +24,16 @@ POLICY = "policy-"
 """Experiments whose name begins so are rows of the table of policies (Fig 4.2)."""
 PROBES_SHOWN = 6
 EXPECTED_BEST_FIRST = (
-    "plus-rmm", "plus-rmm-nopretrain", "plus-rmm-quotas", "plus-rmm-no-equalisation",
+    "search-demo", "plus-rmm", "plus-rmm-nopretrain", "plus-rmm-quotas", "plus-rmm-no-equalisation",
     "plus-rmm-no-fits", "plus-normm-fit", "plus-normm-fit-alone", "plus-normm",
 )  # fmt: skip
+SEARCH = "search-"
+"""Variants of the demo; differences are those to the demo."""
+APART = (
+    "plus-rmm-nopretrain", "plus-rmm-quotas", "plus-rmm-no-equalisation", "plus-rmm-no-fits",
+    "plus-normm-fit-alone",
+)  # fmt: skip
+"""RMM from the first episode, and what is left of it without one of its parts each."""
 RETURNING = ("plus-minus", "plus-minus-normm")
 """Go on from Plus to another corridor, and come back."""
 Named = dict[str, Experiment]
@@ -120,7 +127,7 @@ def _fitted(named: Named) -> list[Block]:
 
 
 def _frozen(named: Named) -> list[Block]:
-    """Frozen drives of comparable experiments together, and differences of all their pairs."""
+    """Frozen drives of comparable experiments together, and differences of their pairs."""
     blocks: list[Block] = []
     for group, shown in _comparable(named).items():
         blocks += _together(group, shown)
@@ -128,13 +135,24 @@ def _frozen(named: Named) -> list[Block]:
 
 
 def _comparable(named: Named) -> dict[str, list[Experiment]]:
-    """Experiments that learned the same corridors, policies apart; alone ones left out."""
+    """Experiments that learned the same corridors, by kind; alone ones left out."""
     groups: dict[str, list[Experiment]] = {}
     for name, experiment in sorted(named.items(), key=_rank):
         worlds = sorted({stage.world for stage in experiment.first.stages})
-        kind = "policies" if name.startswith(POLICY) else "runs"
-        groups.setdefault("-".join([kind, *worlds]), []).append(experiment)
+        for kind in _kinds(name):
+            groups.setdefault("-".join([kind, *worlds]), []).append(experiment)
     return {group: shown for group, shown in groups.items() if len(shown) > 1}
+
+
+def _kinds(name: str) -> list[str]:
+    """The groups an experiment is shown in."""
+    if name.startswith(POLICY):
+        return ["policies"]
+    if name.startswith(SEARCH):
+        return ["search"]
+    if name not in APART:
+        return ["runs"]
+    return ["runs", "parts"] if name == APART[0] else ["parts"]
 
 
 def _rank(item: tuple[str, Experiment]) -> tuple[int, str]:
@@ -155,7 +173,8 @@ def _together(group: str, shown: Sequence[Experiment]) -> list[Block]:
         title = f"Frozen evaluation in {world}, {', '.join(e.name for e in shown)}"
         name = f"{scale}-evaluation-{group}-in-{world}"
         blocks.append(Picture(name, title, caption, drawn))
-    pairs, refused = compare(shown)
+    one_with_others = group.startswith(("search", "parts"))
+    pairs, refused = compare(shown, first_only=one_with_others)
     if pairs:
         caption = (
             "Difference of mean bumps per 1,000 actions of the newest frozen drives; bootstrap "

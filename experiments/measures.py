@@ -101,14 +101,20 @@ def evaluated(column: str, world: str, driver: str = "network") -> Callable[[Run
     return measure
 
 
-def compare(experiments: Sequence[Experiment]) -> tuple[list[Compared], list[str]]:
-    """Differences of bumps between all pairs that drove in the same world.
+def compare(
+    experiments: Sequence[Experiment], *, first_only: bool = False
+) -> tuple[list[Compared], list[str]]:
+    """Differences of bumps between pairs that drove in the same world.
+
+    Args:
+        experiments: At least two.
+        first_only: Only pairs with the first of them, in place of all.
 
     Returns:
         The differences, and one line for every pair with too few seeds to compare.
     """
     pairs, refused = [], []
-    for i, ours in enumerate(experiments):
+    for i, ours in enumerate(experiments[:1] if first_only else experiments):
         for theirs in experiments[i + 1 :]:
             for world in sorted({*ours.worlds} & {*theirs.worlds}):
                 bumps = evaluated("bumps_per_1000", world)

@@ -54,6 +54,8 @@ SHAPES = {
     "policy-eps-greedy-roulette": Shape((("learn", "plus", 100),), best=35,
                                         thesis=(("fitness", 36),)),
 }  # fmt: skip
+VARIANT = Shape((("learn", "plus", 100),), best=60, bumps=9)
+"""Of every other name."""
 
 
 def write_run(out: Path, experiment: str, seed: int, **changes: Any) -> Path:
@@ -61,11 +63,11 @@ def write_run(out: Path, experiment: str, seed: int, **changes: Any) -> Path:
 
     Args:
         out: Folder of all experiments.
-        experiment: One of SHAPES.
+        experiment: One of SHAPES, or a variant that none of the thesis's figures shows.
         seed: Everything is drawn from it and from the name.
         changes: Of run.json.
     """
-    shape = SHAPES[experiment]
+    shape = SHAPES.get(experiment, VARIANT)
     draw = np.random.default_rng([seed, *experiment.encode()])
     folder = out / f"{experiment}-mini" / f"seed-{seed}"
     folder.mkdir(parents=True)

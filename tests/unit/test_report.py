@@ -188,6 +188,18 @@ def test_one_experiment_is_not_compared(tmp_path: Path) -> None:
     assert compare_all([experiment(tmp_path, "i16c")]) == []
 
 
+def test_variants_are_compared_with_what_they_vary(tmp_path: Path) -> None:
+    names = ("search-fast", "search-demo", "search-normm", "plus-rmm-quotas", "plus-rmm-nopretrain")
+    (section,) = compare_all([experiment(tmp_path, name, (1, 2)) for name in names])
+    lines = [line for line in sentences(section).splitlines() if "interval of" in line]
+    pairs = sorted(line.split("interval of ")[1].split(" is ")[0] for line in lines)
+    assert pairs == [
+        "plus-rmm-nopretrain − plus-rmm-quotas",
+        "search-demo − search-fast",
+        "search-demo − search-normm",
+    ]
+
+
 def test_policies_are_a_table_beside_the_thesis(tmp_path: Path) -> None:
     names = ("policy-eps-greedy", "policy-roulette")
     (section,) = compare_all([experiment(tmp_path, name, (1, 2)) for name in names])
