@@ -11,7 +11,9 @@ from experiments.figures import evaluation, probes, progress
 from experiments.measures import (
     MISSING,
     Kept,
+    at_equal_actions,
     compare,
+    difference_at_equal_actions,
     kept,
     max_mean_fitness,
     number,
@@ -36,6 +38,12 @@ APART = (
 """RMM from the first episode, and what is left of it without one of its parts each."""
 RETURNING = ("plus-minus", "plus-minus-normm")
 """Go on from Plus to another corridor, and come back."""
+EQUAL = (
+    ("plus-rmm", "plus-normm"),
+    ("plus-rmm", "plus-normm-fit"),
+    ("plus-rmm-nopretrain", "plus-normm-fit-alone"),
+)
+"""Compared after equally many actions; plus-normm-fit goes on from plus-normm."""
 Named = dict[str, Experiment]
 
 
@@ -51,6 +59,7 @@ def compare_all(experiments: Sequence[Experiment]) -> list[Section]:
                 *_continued(named),
                 *_fitted(named),
                 *_frozen(named),
+                *_equal(named),
                 *_predictions(named, "plus-rmm", "plus-normm", "4.10", of_best=True),
                 *_predictions(named, "plus-minus", "plus-rmm", "4.16", of_best=False),
                 *_kept(named),
@@ -186,6 +195,26 @@ def _together(group: str, shown: Sequence[Experiment]) -> list[Block]:
         told = [*(findings.difference(pair) for pair in pairs), *findings.same_start(shown)]
         blocks.append(Findings(tuple(told)))
     return [*blocks, *(Missing("difference of bumps", line) for line in refused)]
+
+
+def _equal(named: Named) -> list[Block]:
+    """What the thesis compares, after equally many actions of every seed."""
+    blocks: list[Block] = []
+    for first, second in EQUAL:
+        if first not in named or second not in named:
+            continue
+        found = at_equal_actions(named[first], named[second], named, "plus")
+        if not found:
+            continue
+        rows = tuple(
+            (str(e.seed), f"{e.actions:,}", number(e.ours), number(e.theirs)) for e in found
+        )
+        title = f"Bumps per 1,000 actions, frozen in plus, after equally many actions: {first}"
+        header = ("seed", "actions of learning", first, second)
+        blocks.append(Table(f"{title} and {second}", header, rows))
+        if pair := difference_at_equal_actions(first, second, "plus", found):
+            blocks.append(Findings((f"After equally many actions: {findings.difference(pair)}",)))
+    return blocks
 
 
 def _predictions(

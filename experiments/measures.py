@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -127,6 +127,70 @@ def compare(
                 difference = bootstrap_difference(a, b, draw)
                 pairs.append(Compared(ours.name, theirs.name, world, (len(a), len(b)), difference))
     return pairs, refused
+
+
+@dataclass(frozen=True)
+class Equal:
+    """Bumps per 1,000 actions of two networks of one seed after equally many actions of learning.
+
+    Each is the newest frozen drive up to there, which may be some actions older.
+    """
+
+    seed: int
+    actions: int
+    ours: float
+    theirs: float
+
+
+def at_equal_actions(
+    ours: Experiment, theirs: Experiment, named: Mapping[str, Experiment], world: str
+) -> list[Equal]:
+    """Seeds of both, each after as many actions as the one that drove less.
+
+    Args:
+        ours: One experiment.
+        theirs: The other.
+        named: Experiments by name, among them those that the two go on from: their drives and
+            actions come before.
+        world: Where they drove frozen.
+    """
+    found = []
+    rivals = {run.info.seed: run for run in theirs.runs}
+    for run in ours.runs:
+        if (rival := rivals.get(run.info.seed)) is None:
+            continue
+        curves = [_with_before(each, named, world) for each in (run, rival)]
+        if not all(len(actions) for actions, _ in curves):
+            continue
+        end = min(actions[-1] for actions, _ in curves)
+        if any(actions[0] > end for actions, _ in curves):
+            continue
+        a, b = (bumps[np.searchsorted(actions, end, "right") - 1] for actions, bumps in curves)
+        found.append(Equal(run.info.seed, int(end), float(a), float(b)))
+    return found
+
+
+def _with_before(run: Run, named: Mapping[str, Experiment], world: str) -> tuple[Floats, Floats]:
+    """Actions driven while learning, and bumps of frozen drives, predecessors' first."""
+    rows = run.evaluated(world)
+    actions, bumps = rows.numbers("total_actions"), rows.numbers("bumps_per_1000")
+    for before in named[run.info.after].runs if run.info.after in named else ():
+        if before.info.seed == run.info.seed:
+            earlier = _with_before(before, named, world)
+            actions, bumps = np.append(earlier[0], actions), np.append(earlier[1], bumps)
+    return actions, bumps
+
+
+def difference_at_equal_actions(
+    ours: str, theirs: str, world: str, found: Sequence[Equal]
+) -> Compared | None:
+    """The difference over all seeds; None with fewer than two."""
+    if len(found) < 2:
+        return None
+    draw = generator(BOOTSTRAP_SEED, "equal-actions", ours, theirs, world)
+    groups = np.array([(each.ours, each.theirs) for each in found]).T
+    difference = bootstrap_difference(groups[0], groups[1], draw)
+    return Compared(ours, theirs, world, (len(found), len(found)), difference)
 
 
 @dataclass(frozen=True)

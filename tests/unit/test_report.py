@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,9 @@ from experiments.comparisons import compare_all
 from experiments.document import Findings, Missing, Picture, Section, Table, html, markdown
 from experiments.figures.evaluation import BUMPS, COVERAGE, DISTANCE, LAPS, Compared, panels
 from experiments.figures.probes import chosen
-from experiments.measures import kept, number, spread
+from experiments.measures import at_equal_actions, difference_at_equal_actions, kept, number, spread
 from experiments.records import EPISODE_COLUMNS, EVALUATION_COLUMNS, write_csv
-from experiments.runs import Experiment, load, read_run
+from experiments.runs import Experiment, Rows, load, read_run
 from experiments.statistics import Difference
 from services.cli import main
 from tests.synthetic_runs import write_probes, write_route, write_run
@@ -198,6 +199,42 @@ def test_variants_are_compared_with_what_they_vary(tmp_path: Path) -> None:
         "search-demo − search-fast",
         "search-demo − search-normm",
     ]
+
+
+def test_equal_actions_are_those_of_the_seed_that_drove_less(tmp_path: Path) -> None:
+    before, rmm = (experiment(tmp_path, name, (1, 2)) for name in ("plus-normm", "plus-rmm"))
+    named = {"plus-normm": before, "plus-rmm": rmm}
+    for each, run, rival in zip(
+        at_equal_actions(rmm, before, named, "plus"), rmm.runs, before.runs, strict=True
+    ):
+        ends = [int(r.evaluated("plus").rows[-1]["total_actions"]) for r in (run, rival)]
+        assert each.actions == min(ends)
+        for value, side in ((each.ours, run), (each.theirs, rival)):
+            until = [
+                float(row["bumps_per_1000"])
+                for row in side.evaluated("plus").rows
+                if int(row["total_actions"]) <= each.actions
+            ]
+            assert value == until[-1]
+    assert difference_at_equal_actions("plus-rmm", "plus-normm", "plus", [each]) is None
+
+
+@pytest.mark.parametrize(("end", "theirs"), [(100, 10.0), (60, 20.0), (40, 30.0)])
+def test_the_drives_of_a_predecessor_come_before(tmp_path: Path, end: int, theirs: float) -> None:
+    def driven(name: str, *drives: tuple[int, float]) -> Experiment:
+        (run,) = experiment(tmp_path, name).runs
+        plain = run.evaluated("plus").rows[0]
+        rows = tuple(
+            plain | {"total_actions": str(actions), "bumps_per_1000": str(bumps)}
+            for actions, bumps in drives
+        )
+        return Experiment((replace(run, evaluations=Rows(rows)),))
+
+    rmm = driven("plus-rmm", (0, 50.0), (end, 9.0))
+    before = driven("plus-normm", (0, 60.0), (40, 30.0))
+    after = driven("plus-normm-fit", (41, 20.0), (90, 10.0), (150, 5.0))
+    (found,) = at_equal_actions(rmm, after, {"plus-normm": before}, "plus")
+    assert (found.seed, found.actions, found.ours, found.theirs) == (1, end, 9.0, theirs)
 
 
 def test_policies_are_a_table_beside_the_thesis(tmp_path: Path) -> None:
