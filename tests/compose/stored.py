@@ -3,6 +3,7 @@
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 from services.replay.storage import Storage
 from shared.settings import read_folder
@@ -10,7 +11,7 @@ from shared.settings import read_folder
 folder = Path(sys.argv[1])
 config = read_folder(folder)
 storage = Storage(folder / "replay", config.memory, f"{config.run.name}/{config.run.seed}")
-records = []
+records: list[dict[str, Any]] = []
 while (pending := storage.pending(len(records))) is not None:
     records.append(pending[1])
 memory = storage.load()
@@ -26,7 +27,6 @@ sys.stdout.write(
             "counted": counters.episode,
             "dropped_samples": counters.dropped_samples,
             "dropped_episodes": counters.dropped_episodes,
-            "duplicates": counters.duplicates,
         }
     )
     + "\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -16,14 +17,17 @@ from typing import Any
 import pytest
 import yaml
 import zenoh
+from builders import LIFE, make_episode
 from fakes import fake_service, message
 
 from services.monitor import health
+from services.replay.storage import Storage
 from shared import settings
 from shared.bus import Bus, zenoh_config
 from shared.config import BusConfig, Config, RunConfig
 from shared.keys import ACTOR_STATE, LEARNER_STATE, REPLAY_STATE, ROBOT_STATE, Stream
 from shared.messages import ActorState, LearnerState, Message, ReplayState, RobotState
+from tests.compose.trial import Failed, Trial
 
 ROOT = Path(__file__).parents[2]
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
@@ -379,3 +383,39 @@ def test_the_check_says_in_one_line_what_is_or_is_wrong(
     said = capsys.readouterr()
     assert said.out == "accepts sessions\n"
     assert said.err.count("\n") == 2
+
+
+def test_what_the_trial_reads_from_disk_is_what_was_acknowledged(tmp_path: Path) -> None:
+    """`tests/compose/stored.py`, which runs in the replay image, and the trial's check of it."""
+    config = Config.model_validate({"run": {"name": "trial"}, "memory": {"fill": "none"}})
+    settings.claim(tmp_path, config)
+    storage = Storage(tmp_path / "replay", config.memory, f"trial/{config.run.seed}")
+    for number in (1, 2):
+        storage.commit(make_episode(5, seed=number, number=number))
+    storage.commit(make_episode(5, seed=2, number=2))  # again: not stored twice
+    storage.close()
+    done = subprocess.run(
+        [sys.executable, "tests/compose/stored.py", str(tmp_path)],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    stored = json.loads(done.stdout)
+    assert [tuple(item) for item in stored["submissions"]] == [
+        ("robot1", LIFE, 1),
+        ("robot1", LIFE, 2),
+    ]
+    trial = Trial()
+    trial.check_stored(stored, 2)
+    assert trial.passed
+    for wrong in (
+        {"counted": 1},  # fewer than were announced
+        {"submissions": stored["submissions"][:1]},
+        {"submissions": [stored["submissions"][0]] * 2},
+        {"submissions": [["robot1", LIFE, 1], ["robot1", LIFE, 3]]},
+        {"episodes": [1, 1]},
+    ):
+        with pytest.raises(Failed):
+            trial.check_stored(stored | wrong, 2)
