@@ -164,13 +164,15 @@ def starting() -> Iterator[None]:
 
 
 def answer_signals(stop: StopFlag) -> None:
-    """Let SIGTERM and SIGINT set the flag from now on, and one that was held back do it now."""
+    """Let SIGTERM, SIGINT and a closed terminal set the flag; one held back does it now."""
 
     def on_signal(number: int, _: FrameType | None) -> None:
         stop.set(signal.Signals(number).name)
 
     signal.signal(signal.SIGTERM, on_signal)
     signal.signal(signal.SIGINT, on_signal)
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as under nohup
+        signal.signal(signal.SIGHUP, on_signal)
     for number in _held:
         on_signal(number, None)
 

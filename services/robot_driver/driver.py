@@ -60,6 +60,8 @@ class Driver:
         self.state: State = "waiting"
         self.watch: Callable[[], None] = lambda: None
         """Called while the robot recovers, so that commands take effect then too."""
+        self.stopping: Callable[[], bool] = lambda: False
+        """Whether the service is to stop: a recovery is broken off then (real time)."""
         self.tell: Callable[[str], None] = lambda _line: None
         """Called with what became of each change of the world, for a log."""
         self.keep: Callable[[dict[str, Any]], None] = lambda _kept: None
@@ -197,10 +199,14 @@ class Driver:
         self._interruption = interruption or self._interruption
         self.state = "waiting"
 
-    def block(self, reason: str) -> None:
-        """The robot is not fit to drive: stand still until `fit`, then look anew."""
+    def block(self, reason: str, *, bump: bool = False) -> None:
+        """The robot is not fit to drive: stand still until `fit`, then look anew.
+
+        A bump at that moment is counted and not recovered from: nobody knows when it goes on.
+        """
         self.halt()
         self.blocks += 1
+        self.bumps += int(bump)
         self.look_again("blocked")
         self.state, self.reason = "blocked", reason
 
@@ -391,13 +397,13 @@ class Driver:
         """
         self.state = "recovering"
         slice_s = SLICE_S if self._realtime else None
-        robot = WatchedRobot(self._robot, self.safety, self.watch, slice_s)
+        robot = WatchedRobot(self._robot, self.safety, self.watch, slice_s, self.stopping)
         try:
             yield robot
             if self._config.robot.kind != "sim":  # it still moves when told to stop
                 robot.run(self._config.robot.hardware.rest_s, stop_on_contact=False)
-        except Halted:  # it stands where it was stopped; the operator's `clear` tells the actor
-            pass
+        except Halted:  # it stands where it was stopped; the operator's `clear`, or the restart,
+            pass  # tells the actor
         except NotReady:  # it stands; the next look tells why, and the actor
             self.halt()
         self._moving = False

@@ -46,6 +46,8 @@ class Gate:
         self._last_s = -math.inf
         self._next_s = -math.inf
         self._zeros = 0
+        self._still_s = -math.inf
+        """From then on the robot stands: it coasts for a while after a stop."""
 
     @property
     def stuck(self) -> bool:
@@ -83,20 +85,22 @@ class Gate:
         regardless: it means to move with a pressed bumper, slowly, until it wants standstill.
         """
         self._regardless = regardless
+        if regardless:
+            self._still_s = -math.inf
         self._expire(now_s)
         self._until_s = now_s + self.lease_s
 
-    def feel(self, pressed: bool) -> None:
-        """Take a reading of the bumper."""
+    def feel(self, pressed: bool, now_s: float) -> None:
+        """Take a reading of the bumper. Who touches a standing robot is no contact."""
         self.pressed = pressed
         if not pressed:
             self._pressed_m = 0.0
-        elif self._wanted.moving and not self._regardless:
+        elif not self._regardless and (self._wanted.moving or now_s < self._still_s):
             self.hit = True
 
     def handled(self) -> bool:
-        """The driver looks: whether there was contact since it last looked, or is now."""
-        contact = self.hit or self.pressed
+        """The driver looks: whether the robot hit something since, or is to move pressed."""
+        contact = self.hit or (self.pressed and self._wanted.moving)
         self.hit = False
         return contact
 
@@ -126,6 +130,9 @@ class Gate:
 
     def sent(self, velocity: Velocity, now_s: float, *, arrived: bool) -> None:
         """A velocity was sent; what did not arrive is sent again."""
+        moved = velocity.moving or (self._last is not None and self._last.moving)
+        if moved and not self._regardless:
+            self._still_s = now_s + self._config.hardware.rest_s
         self._last = velocity
         self._next_s = now_s + self._config.hardware.command_period_s
         if arrived and not velocity.moving:

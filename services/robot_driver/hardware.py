@@ -126,10 +126,10 @@ class HardwareRobot:
                 left_s = self._due_s - now_s
                 if left_s > 0.0:
                     self._changed.wait(min(left_s, TICK_S))
-            self._check()
+            self._check(contact=contact)
             if lapsed:
                 self.drive(STANDSTILL)
-                raise NotReady("driver: hung for longer than a velocity is leased")
+                raise _not_ready("driver: hung for longer than a velocity is leased", contact)
             if left_s <= 0.0:
                 return contact
 
@@ -162,8 +162,11 @@ class HardwareRobot:
 
     # ------------------------------------------------------------ fit to drive
 
-    def _check(self) -> None:
-        """Raise NotReady, the robot told to stop, when it must not move."""
+    def _check(self, *, contact: bool = False) -> None:
+        """Raise NotReady, the robot told to stop, when it must not move.
+
+        contact: What the exception tells of it.
+        """
         with self._changed:
             self._gate.problem = problem = self._problem(self._clock())
             if self._gate.stuck:
@@ -172,7 +175,7 @@ class HardwareRobot:
                 self._gate.drive(STANDSTILL, self._clock())
                 self._changed.notify_all()
         if problem:
-            raise NotReady(problem)
+            raise _not_ready(problem, contact)
 
     def _problem(self, now_s: float) -> str:
         """Why the robot must not move now; empty when it may."""
@@ -189,9 +192,11 @@ class HardwareRobot:
         battery = link.battery.get()
         if battery is not None and battery.value.low:
             return "battery: low"
+        if obstacle := link.obstacle():
+            return obstacle
         if self._unsent >= REFUSALS:
             return f"command: does not get through: {self._unsent_reason}"
-        return link.obstacle()
+        return ""
 
     def _pose(self) -> Pose:
         reading = self._link.odometry.get()
@@ -209,7 +214,8 @@ class HardwareRobot:
             ("camera", self._link.camera),
         ):
             if slot.wait(0, max(limit_s - self._clock(), 0.0)) is None:
-                seen = ", ".join(f"{fault} ({n})" for fault, n in self._link.faults.most_common(3))
+                faults = Counter(dict(self._link.faults))  # its threads go on counting
+                seen = ", ".join(f"{fault} ({n})" for fault, n in faults.most_common(3))
                 raise RobotFault(
                     f"robot: no {name} within robot.hardware.open_timeout_s "
                     f"({self._config.hardware.open_timeout_s:g} s)" + (f"; {seen}" if seen else "")
@@ -224,7 +230,7 @@ class HardwareRobot:
                 continue
             number = reading.number
             with self._changed:
-                self._gate.feel(reading.value)
+                self._gate.feel(reading.value, self._clock())
                 if reading.value:
                     self._changed.notify_all()
 
@@ -239,12 +245,20 @@ class HardwareRobot:
                     if self._gate.silent or now_s > deadline_s:
                         return
                 if self._gate.wants_motion:
-                    self._gate.problem = self._problem(now_s)
+                    self._gate.problem = self._problem_or_none(now_s)
                 velocity = self._gate.due(now_s)
                 if velocity is None:
                     self._changed.wait(TICK_S if self._busy else 0.1)
                     continue
             self._hand_over(velocity)
+
+    def _problem_or_none(self, now_s: float) -> str:
+        """As `_problem`; a link that cannot even say is a problem, and no end of the sender."""
+        try:
+            return self._problem(now_s)
+        except Exception as error:
+            log.exception("looking at the robot failed")
+            return f"link: {type(error).__name__}: {error}"
 
     @property
     def _busy(self) -> bool:
@@ -268,6 +282,12 @@ class HardwareRobot:
     def _send_zeros(self) -> None:
         for _ in range(ZEROS):
             self._hand_over(STANDSTILL)
+
+
+def _not_ready(problem: str, contact: bool) -> NotReady:
+    error = NotReady(problem)
+    error.contact = contact
+    return error
 
 
 def _there(reading: Reading[T] | None) -> T:

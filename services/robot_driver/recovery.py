@@ -15,14 +15,14 @@ from shared.config import RobotConfig
 
 
 class Halted(Exception):
-    """An operator stopped the robot while it recovered."""
+    """An operator or the end of the service stopped the robot while it recovered."""
 
 
 class WatchedRobot:
     """A robot during recovery: every command passes the limits, and an operator can stop it.
 
-    `watch` is called every `slice_s` while the robot moves; with None a motion is one piece, as
-    simulated time demands.
+    `watch` is called every `slice_s` while the robot moves; a motion ends by the robot's clock,
+    however long the looks take. With None it is one piece, as simulated time demands.
     """
 
     def __init__(
@@ -31,9 +31,10 @@ class WatchedRobot:
         safety: Safety,
         watch: Callable[[], None],
         slice_s: float | None,
+        stopping: Callable[[], bool] = lambda: False,
     ) -> None:
         self._robot, self._safety = robot, safety
-        self._watch, self._slice_s = watch, slice_s
+        self._watch, self._slice_s, self._stopping = watch, slice_s, stopping
         self.sense, self.feel = robot.sense, robot.feel
         self.now_s, self.close = robot.now_s, robot.close
         self.state, self.restore = robot.state, robot.restore
@@ -44,16 +45,24 @@ class WatchedRobot:
 
     def run(self, duration_s: float, *, stop_on_contact: bool) -> bool:
         """Let time pass, looking out for an operator. Raises Halted, standing still."""
-        contact = False
-        while duration_s > 0.0:
-            part_s = min(self._slice_s or duration_s, duration_s)
+        if duration_s <= 0.0:
+            return False
+        if self._slice_s is None:
+            contact = self._robot.run(duration_s, stop_on_contact=stop_on_contact)
+            self._look(stopping=False)
+            return contact
+        contact, end_s = False, self._robot.now_s() + duration_s
+        while (left_s := end_s - self._robot.now_s()) > 1e-9:
+            part_s = min(self._slice_s, left_s)
             contact |= self._robot.run(part_s, stop_on_contact=stop_on_contact)
-            duration_s -= part_s
-            self._watch()
-            if self._safety.halted:
-                self._robot.drive(STANDSTILL)
-                raise Halted
+            self._look(stopping=self._stopping())
         return contact
+
+    def _look(self, *, stopping: bool) -> None:
+        self._watch()
+        if self._safety.halted or stopping:
+            self._robot.drive(STANDSTILL)
+            raise Halted
 
 
 RELEASE_M = 0.05
@@ -78,7 +87,8 @@ def back_off(robot: Robot, config: RobotConfig, heading_rad: float) -> float:
     blocked = _move(robot, config, -config.recovery_distance_m)
     here = robot.feel().pose
     if blocked:
-        _move(robot, config, _distance(start, here) / 2.0)
+        won_m = min(_distance(start, here), config.recovery_distance_m)  # odometry may jump
+        _move(robot, config, won_m / 2.0)
         here = robot.feel().pose
     turn = math.remainder(heading_rad - here.heading_rad, 2.0 * math.pi)
     robot.drive(Velocity(0.0, 0.0, math.copysign(config.turn_rad_s, turn)))

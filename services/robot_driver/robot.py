@@ -95,3 +95,6 @@ class NotReady(RobotFault):
 
     The text says why. Once that is over the robot can go on.
     """
+
+    contact = False
+    """Whether it also hit something as it became so."""

@@ -21,6 +21,8 @@ from shared.config import Config
 from shared.errors import ConfigError
 from shared.messages import ImageArray
 
+log = logging.getLogger(__name__)
+
 SERVER_SPEED_M_S, SERVER_TURN_RAD_S = 2.0, 3.0
 """The robot's server refuses faster commands instead of cutting them."""
 LABEL: Final = {"sid": "corridor"}
@@ -49,13 +51,13 @@ class RobotinoLink:
         self._counting = threading.Lock()
         self._done = threading.Event()
         self._threads: list[threading.Thread] = []
-        command_s = min(robotino.timeout_s, config.robot.hardware.command_period_s)
+        self._command_s = min(robotino.timeout_s, config.robot.hardware.command_period_s)
         port = robotino.address.rpartition(":")[2]
         if port.isdecimal() and int(port) > 65535:
             raise ConfigError(
                 f"robot.robotino.address: expected a port up to 65535, got {robotino.address!r}"
             )
-        self._commands = self._client(command_s)
+        self._commands = self._client(self._command_s)
         self._sequence: int | None = None
         self._picture = b""
 
@@ -93,16 +95,24 @@ class RobotinoLink:
         )
         try:
             content = json.dumps(wanted, allow_nan=False).encode()
-            reply = self._commands.put(
-                "/data/omnidrive",
-                params=LABEL,
-                content=content,
-                headers={"Content-Type": "application/json"},
-            )
-        except (httpx.HTTPError, ValueError, RuntimeError) as error:
+            status = self._put(content)
+        except (httpx.HTTPError, httpx.StreamError, ValueError, RuntimeError) as error:
             raise self._fault("command", _reason(error)) from error
-        if reply.status_code != httpx.codes.OK:
-            raise self._fault("command", f"status {reply.status_code}")
+        if status != httpx.codes.OK:
+            raise self._fault("command", f"status {status}")
+
+    def _put(self, content: bytes) -> int:
+        """Send a command; the status is answer enough, its body is read only while it comes."""
+        headers = {"Content-Type": "application/json"}
+        end_s, size = time.monotonic() + self._command_s, 0
+        with self._commands.stream(
+            "PUT", "/data/omnidrive", params=LABEL, content=content, headers=headers
+        ) as reply:
+            for chunk in reply.iter_raw():  # to its end, so that the connection stays open
+                size += len(chunk)
+                if size > replies.MAX_JSON_BYTES or time.monotonic() > end_s:
+                    break
+            return reply.status_code
 
     def close(self) -> None:
         """Stop reading and disconnect. May be called twice."""
@@ -131,6 +141,9 @@ class RobotinoLink:
                     self._fault(name, str(error))
                 except (httpx.HTTPError, httpx.StreamError, RuntimeError) as error:
                     self._fault(name, _reason(error))
+                except Exception as error:  # one odd answer must not end all reading
+                    log.exception("%s: could not be read", name)
+                    self._fault(name, type(error).__name__)
 
     def _fetch(self, client: httpx.Client, path: str, limit: int) -> bytes:
         """The body of one answer, at most `limit` bytes of it. Raises BadReply, HTTPError."""

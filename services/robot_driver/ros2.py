@@ -119,10 +119,22 @@ class Ros2Link:
         return self._velocity_type()[1] or self._wrong_sensor()
 
     def send(self, velocity: Velocity) -> None:
-        """Publish one command; motion only where `obstacle` is empty. Raises RobotFault."""
+        """Publish one command; motion only where `obstacle` is empty.
+
+        Raises:
+            RobotFault: Also for a stop that was published while nobody is known to listen.
+        """
         kind, obstacle = self._velocity_type()
-        if not kind or (obstacle and velocity.moving):
-            raise RobotFault(obstacle)
+        try:
+            if kind and not (obstacle and velocity.moving):
+                self._publish(velocity, kind)
+            if obstacle:
+                raise RobotFault(obstacle)
+        except RobotFault as error:
+            self.faults[f"command: {str(error).split(':')[0]}"] += 1
+            raise
+
+    def _publish(self, velocity: Velocity, kind: VelocityType) -> None:
         with self._sending:
             now_ns = time.time_ns()
             self._sequence[kind] += 1

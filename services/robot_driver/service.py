@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import logging
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -22,6 +23,8 @@ from shared.service import TICK_S, Service, Stopped, new_life, service
 if TYPE_CHECKING:
     from services.robot_driver.sim import Laps, SimRobot
     from services.robot_driver.world import Obstacle, World
+
+log = logging.getLogger(__name__)
 
 STATE, WORLD = "state.msgpack", "world.msgpack"
 """Files of a robot: all of a driver that was stopped; its world, also of one that was killed."""
@@ -54,6 +57,13 @@ def _real(config: Config) -> Robot:
     from services.robot_driver.hardware import HardwareRobot
 
     kind = config.robot.kind
+    for name in ("camera_stale_s", "odometry_stale_s", "bumper_stale_s"):
+        if getattr(config.robot.hardware, name) > 2.0 * config.robot.period_s:
+            log.warning(
+                "robot.hardware.%s is longer than two robot.period_s: the robot stops later "
+                "than it could",
+                name,
+            )
     module = importlib.import_module(f"services.robot_driver.{kind}")
     link = getattr(module, LINKS[kind])(config)
     try:
@@ -127,7 +137,7 @@ class DriverLoop:
         self._next_beat_s = 0.0
         self._estop_mark = folder / "robot" / self._robot / "estop"
         driver.safety.estop |= self._estop_mark.exists()
-        driver.watch = self.beat
+        driver.watch, driver.stopping = self.beat, me.stop.is_set
         driver.tell = me.log.info
 
     def run(self) -> None:
@@ -143,9 +153,11 @@ class DriverLoop:
             with request:
                 if isinstance(request.message, RobotCommand):
                     self._driver.command(request.message.command)
-                    self._remember_estop()
                     self._me.log.info("operator: %s", request.message.command)
-                    request.reply(self._driver.report(self._inbox.refused_total))
+                    if problem := self._remember_estop():
+                        request.refuse(problem)
+                    else:
+                        request.reply(self._driver.report(self._inbox.refused_total))
                     force = True
                 elif isinstance(request.message, WorldChange):
                     between_actions = self._driver.state == "waiting"
@@ -157,12 +169,25 @@ class DriverLoop:
             report = self._driver.report(self._inbox.refused_total)
             self._me.bus.publish(ROBOT_STATE, report, self._robot)
 
-    def _remember_estop(self) -> None:
-        """Keep the latch on disk before it is acknowledged: not even kill -9 releases it."""
-        if self._driver.safety.estop:
-            statefile.write_atomically(self._estop_mark, b"emergency stop: corridor clear\n")
-        else:
-            self._estop_mark.unlink(missing_ok=True)
+    def _remember_estop(self) -> str:
+        """Keep the latch on disk before it is acknowledged: not even kill -9 releases it.
+
+        Returns why it could not be kept (a full disk); the robot stays stopped all the same, and a
+        latch that cannot be taken off the disk is not released.
+        """
+        safety = self._driver.safety
+        try:
+            if safety.estop:
+                statefile.write_atomically(self._estop_mark, b"emergency stop: corridor clear\n")
+            elif self._estop_mark.exists():
+                self._estop_mark.unlink()
+        except OSError as error:
+            released, safety.estop = not safety.estop, True
+            self._driver.halt()
+            what = "not cleared" if released else "stopped, but a restart would release it"
+            self._me.log.error("emergency stop: %s: %s", what, error)
+            return f"{what}: {error}"
+        return ""
 
     # ------------------------------------------------------------ lockstep
 
@@ -204,7 +229,7 @@ class DriverLoop:
         try:
             self._control_period()
         except NotReady as problem:
-            self._driver.block(str(problem))
+            self._driver.block(str(problem), bump=problem.contact)
             self._stand_by()
 
     def _stand_by(self) -> None:
@@ -228,7 +253,9 @@ class DriverLoop:
         observation, of the same number, says so.
         """
         driver, period_s = self._driver, self._config.robot.period_s
-        self._me.bus.publish(OBSERVATION, driver.observe(), self._robot)
+        observation = driver.observe()
+        if not driver.safety.halted:  # an answer could not be carried out
+            self._me.bus.publish(OBSERVATION, observation, self._robot)
         left_s, started, hold, bump = period_s, False, False, False
         attempt = driver.attempt
         while left_s > 1e-9 and not bump and not self._me.stop.is_set():
@@ -259,9 +286,11 @@ class DriverLoop:
         if driver.safety.halted:
             driver.halt()
             self._inbox.wait(TICK_S)
+        elif driver.attempt != attempt:  # stopped and released within the period: it looks again
+            driver.halt()
         elif started or bump:
             driver.settle(bump, executed=started)
-        elif driver.attempt == attempt:
+        else:
             driver.halt()
             driver.late_actions += int(not hold)
             driver.look_again("" if hold else "late")

@@ -119,9 +119,14 @@ def test_it_refuses_to_drive_what_listens_for_another_type(hand: Hand) -> None:
 
 
 def test_nobody_who_listens_is_driven_but_may_be_stopped(hand: Hand) -> None:
+    """A stop is published all the same, but does not count as one that arrived."""
     with linked(hand, velocity_type="Twist") as link:
-        with pytest.raises(RobotFault, match="nothing on the robot listens on cmd_vel"):
-            link.send(AHEAD)
+        for velocity in (AHEAD, STANDSTILL):
+            with pytest.raises(RobotFault, match="nothing on the robot listens on cmd_vel"):
+                link.send(velocity)
+        assert sum(link.faults[name] for name in link.faults if name.startswith("command")) == 2
+        hand.listen("Twist")
+        wait_obstacle(link, "")
         link.send(STANDSTILL)
 
 

@@ -71,14 +71,14 @@ def test_a_driver_that_hangs_loses_its_lease_for_good() -> None:
 def test_contact_stops_it_until_the_driver_has_looked_and_the_bumper_is_free() -> None:
     gate = gate_of()
     gate.drive(AHEAD, 0.0)
-    gate.feel(True)
+    gate.feel(True, 0.0)
     assert gate.in_force(0.0) == STANDSTILL
-    gate.feel(False)  # so short a contact that the driver has not seen it
+    gate.feel(False, 0.0)  # so short a contact that the driver has not seen it
     assert gate.in_force(0.0) == STANDSTILL
     assert gate.handled()
     assert not gate.handled()
     assert gate.in_force(0.0) == AHEAD
-    gate.feel(True)
+    gate.feel(True, 0.0)
     assert gate.handled()
     gate.drive(AHEAD, 0.1)
     assert gate.in_force(0.1) == STANDSTILL
@@ -86,14 +86,40 @@ def test_contact_stops_it_until_the_driver_has_looked_and_the_bumper_is_free() -
 
 def test_somebody_who_touches_a_standing_robot_is_no_bump() -> None:
     gate = gate_of()
-    gate.feel(True)
-    gate.feel(False)
+    gate.feel(True, 0.0)
+    assert not gate.handled()
+    gate.feel(False, 0.0)
+    assert not gate.handled()
+
+
+@pytest.mark.parametrize(("after_s", "bump"), [(0.1, True), (CONFIG.hardware.rest_s + 0.2, False)])
+def test_contact_counts_while_the_robot_coasts_after_a_stop(after_s: float, bump: bool) -> None:
+    gate = gate_of()
+    gate.drive(AHEAD, 0.0)
+    sent(gate, 0.0, 0.1)
+    gate.drive(STANDSTILL, 0.1)
+    sent(gate, 0.1, 0.1)
+    gate.feel(True, 0.1 + after_s)
+    assert gate.handled() is bump
+
+
+def test_a_recovery_that_ends_pressed_is_no_new_contact() -> None:
+    gate = gate_of()
+    gate.feel(True, 0.0)
+    gate.drive(SLOWLY, 0.0)
+    gate.renew(0.0, regardless=True)
+    sent(gate, 0.0, 0.1)
+    gate.drive(STANDSTILL, 0.1)
+    gate.renew(0.1, regardless=True)  # the rest
+    sent(gate, 0.1, 0.1)
+    gate.renew(0.2, regardless=False)
+    gate.feel(True, 0.21)
     assert not gate.handled()
 
 
 def test_recovery_moves_a_pressed_robot_slowly_only() -> None:
     gate = gate_of()
-    gate.feel(True)
+    gate.feel(True, 0.0)
     gate.drive(SLOWLY, 0.0)
     assert gate.in_force(0.0) == STANDSTILL
     gate.renew(0.0, regardless=True)
@@ -108,7 +134,7 @@ def test_recovery_moves_a_pressed_robot_slowly_only() -> None:
 
 def test_recovery_ends_where_the_bumper_never_lets_go() -> None:
     gate = gate_of()
-    gate.feel(True)
+    gate.feel(True, 0.0)
     now_s, way_m = 0.0, 0.0
     gate.drive(SLOWLY, now_s)
     while not gate.stuck and now_s < 100.0:
@@ -119,7 +145,7 @@ def test_recovery_ends_where_the_bumper_never_lets_go() -> None:
     allowed_m = PRESSED_RECOVERIES * CONFIG.recovery_distance_m
     assert way_m == pytest.approx(allowed_m, abs=0.01)
     assert gate.in_force(now_s) == STANDSTILL
-    gate.feel(False)
+    gate.feel(False, 0.0)
     assert not gate.stuck
 
 
@@ -189,7 +215,7 @@ def test_no_history_lets_it_move_when_it_must_not(
             gate.renew(now_s, regardless=bool(value))
             called_s = now_s
         elif what == "feel":
-            gate.feel(bool(value))
+            gate.feel(bool(value), now_s)
         elif what == "problem":
             gate.problem = "stale" if value else ""
         elif what == "handled":
