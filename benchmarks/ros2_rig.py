@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import Any
 
 from benchmarks.robot_rig import PATIENCE_S, Rig
-from services.robot_driver.emulation.ros2_network import FAULTS_KEY, TRUTH_KEY
+from services.robot_driver.emulation.ros2_faults import FAULTS_KEY, TRUTH_KEY
 from shared import settings
 from shared.bus import Bus
 from shared.config import Config

@@ -187,7 +187,7 @@ def _together(group: str, shown: Sequence[Experiment]) -> list[Block]:
     if pairs:
         caption = (
             "Difference of mean bumps per 1,000 actions of the newest frozen drives; bootstrap "
-            "over seeds, 95 % interval. Filled: it excludes 0. With few seeds it is rough."
+            "over seeds, 95 % interval, too narrow with few seeds. Filled: it excludes 0."
         )
         drawn = partial(evaluation.differences, pairs)
         name = f"{scale}-differences-{group}"

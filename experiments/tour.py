@@ -85,15 +85,18 @@ class _Log:
     poses: list[tuple[float, float, float]]
     bumps: list[bool] = field(default_factory=list)
     driven: list[bool] = field(default_factory=list)
+    way_m: list[float] = field(default_factory=list)
+    """Of each action; recovery not included."""
     events: list[Event] = field(default_factory=list)
 
     def tell(self, text: str) -> None:
         self.events.append(Event(len(self.events) + 1, len(self.bumps), text))
 
-    def add(self, pose: Pose, *, bump: bool, driven: bool) -> None:
+    def add(self, pose: Pose, *, bump: bool, driven: bool, way_m: float = 0.0) -> None:
         self.poses.append((pose.x_m, pose.y_m, pose.heading_rad))
         self.bumps.append(bump)
         self.driven.append(driven)
+        self.way_m.append(way_m)
 
 
 def drive_tour(
@@ -141,12 +144,15 @@ def drive_tour(
             observation = env.turn(side == "left")
             log.add(env.robot.pose, bump=False, driven=False)
             continue
+        before = env.robot.pose
         _, _, bumped, _, info = env.step(np.int64(action))
+        here = env.robot.pose
+        way_m = math.hypot(here.x_m - before.x_m, here.y_m - before.y_m)
         if bumped:
             _, info = env.reset()
             log.tell("bumps")
         observation = info["observation"]
-        log.add(env.robot.pose, bump=bumped, driven=True)
+        log.add(env.robot.pose, bump=bumped, driven=True, way_m=way_m)
     if dropped:
         env.robot.remove(BOX_NAME)
     return _tour(env, log, dropped)
@@ -180,14 +186,13 @@ def _bridges(world: World, places_m: npt.NDArray[np.float64]) -> tuple[str, ...]
 
 def _tour(env: CorridorEnv, log: _Log, dropped: bool) -> Tour:
     world, poses = env.robot.world, np.array(log.poses)
-    way_m = np.hypot(*np.diff(poses[:, :2], axis=0).T)
     laps = env.robot.laps
     trace = Trace(
         world=world.name,
         bumps=np.array(log.bumps, np.bool_),
         places_m=poses[:, :2],
         headings_rad=poses[:, 2],
-        way_m=way_m,
+        way_m=np.array(log.way_m),
         laps_left=laps.left,
         laps_right=laps.right,
     )

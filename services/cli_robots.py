@@ -83,7 +83,7 @@ def emulate_ros2(
     if tethered:
         tether()
     loaded = load(preset, config, set_, others={"robot.ros2.transport": transport})
-    emulator = import_role("services.robot_driver.emulation.ros2", "ros2")
+    emulator = import_role("services.robot_driver.emulation.ros2", "sim,ros2")
     try:
         faults = emulator.Ros2Faults().with_texts(fault or [])
     except ValueError as error:
@@ -105,5 +105,5 @@ def emulate_fault(
     ] = "tcp/127.0.0.1:7448",
 ) -> None:
     """Let an emulated ROS 2 robot have a fault, or tell which it has."""
-    emulator = import_role("services.robot_driver.emulation.ros2", "ros2")
+    emulator = import_role("services.robot_driver.emulation.ros2_faults", "ros2")
     typer.echo(emulator.change_faults(endpoint, changes or []))

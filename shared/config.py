@@ -48,7 +48,7 @@ class RunConfig(Section):
 class BusConfig(Section):
     """How services reach the Zenoh router."""
 
-    endpoint: str = Field(default="tcp/127.0.0.1:7447", min_length=5)
+    endpoint: str = Field(default="tcp/127.0.0.1:7447", pattern=r"^[a-z][a-z0-9-]*/\S+$")
     """Where clients connect, and where our own router listens (loopback unless told otherwise)."""
     lease_ms: int = Field(default=2000, ge=200, le=60000)
     """A frozen or cut-off service counts as gone after this time."""

@@ -198,12 +198,17 @@ class ForeignBus:
 
     def __init__(self, endpoint: str, mode: Literal["client", "router"] = "client") -> None:
         client = mode == "client"
-        config = zenoh_config(
-            mode,
-            connect=[endpoint] if client else [],
-            listen=[] if client else [endpoint],
-            shared_memory=False,
-        )
+        try:
+            config = zenoh_config(
+                mode,
+                connect=[endpoint] if client else [],
+                listen=[] if client else [endpoint],
+                shared_memory=False,
+            )
+        except zenoh.ZError as error:
+            raise ConfigError(
+                f"{endpoint!r} is no Zenoh endpoint: expected one such as tcp/127.0.0.1:7447"
+            ) from error
         try:
             self._session = zenoh.open(config)
         except zenoh.ZError as error:

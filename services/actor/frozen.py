@@ -77,6 +77,9 @@ def read(path: Path) -> Frozen:
     try:
         with safe_open(path, framework="pt") as file:
             state = json.loads((file.metadata() or {}).get("state", "{}"))
+            counters = state.get("counters", {}) if isinstance(state, dict) else None
+            if not isinstance(counters, dict):
+                raise ValueError("expected an object as its state")
             names = list(file.keys())
             prefix = TARGET if any(name.startswith(TARGET) for name in names) else ""
             tensors = {
@@ -86,5 +89,5 @@ def read(path: Path) -> Frozen:
             }
     except (OSError, SafetensorError, ValueError) as error:
         raise StateError(f"{path}: damaged weights: {error}") from error
-    steps = state.get("counters", {}).get("train_steps")
-    return Frozen(path, save_safetensors(tensors), state.get("episode"), steps)
+    episode, steps = state.get("episode"), counters.get("train_steps")
+    return Frozen(path, save_safetensors(tensors), episode, steps)

@@ -130,11 +130,15 @@ class Recording:
                         yield recorded
 
     def load(self, weights: Weights) -> bytes:
-        """The safetensors bytes of a version. They are not checked. Raises StateError."""
+        """The safetensors bytes of a version, as they were written. Raises StateError."""
         with self._path.open("rb") as file:
             file.seek(weights.offset)
             _, body = self._record(file, self._path.stat().st_size) or (0, b"")
         data: bytes = self._parse(Attachment.read, body).data
+        if int.from_bytes(body[-4:], "little") not in (0, zlib.crc32(body[:-4])):  # 0: none told
+            raise StateError(
+                f"{self._path}: damaged: weights {weights.version} do not match their checksum"
+            )
         return data
 
     def _records(self, *, whole: bool) -> Iterator[tuple[int, int, bytes]]:
@@ -202,7 +206,7 @@ class Recording:
         """A record from its content, by the reader of its class. Raises StateError."""
         try:
             return read(ReadDataStream(BytesIO(body)))
-        except (McapError, struct.error, UnicodeDecodeError) as error:
+        except (McapError, struct.error, UnicodeDecodeError, OverflowError) as error:
             raise StateError(f"{self._path}: damaged: {error or type(error).__name__}") from error
 
     def _note_weights(self, offset: int, body: bytes) -> None:

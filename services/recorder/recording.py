@@ -91,7 +91,8 @@ class RecordingWriter:
         trace: TracebackType | None,
     ) -> None:
         try:
-            self._writer.finish()  # type: ignore[no-untyped-call]
+            if kind is None:  # else the file breaks off, as after a kill, and is read as such
+                self._writer.finish()  # type: ignore[no-untyped-call]
         finally:
             self._file.close()
 

@@ -39,12 +39,15 @@ def run(
     Raises:
         ConfigError: The numerics of the actor are not known, the file cannot be made, or the run
             has another configuration.
+        StateError: The file cannot be written any more.
     """
     origin = Origin(config, actor_numerics(config, folder))
     try:
         with service("recorder", "main", config) as me, RecordingWriter(path, origin) as writer:
             echo(f"recording run {config.run.name!r} to {path}; Ctrl-C ends it")
             Recorder(me, writer, limit_mib * MIB, echo).run()
+    except OSError as error:
+        raise StateError(f"--out: {path}: cannot be written: {error.strerror}") from error
     except Stopped:
         echo(f"nothing recorded: stopped while there was no router at {config.bus.endpoint}")
         return EXIT_CRASH
@@ -78,7 +81,7 @@ class Recorder:
         self._tap = me.bus.tap(RECORDED)
         self._fetcher = WeightsFetcher(me, self._tap.wake)
         me.stop.on_set(self._tap.wake)
-        self._version = self._versions = 0
+        self._version = self._versions = self._skipped = 0
         self._started_s = time.monotonic()
 
     def run(self) -> None:
@@ -106,6 +109,7 @@ class Recorder:
         return {
             "messages": self._writer.messages,
             "weights": self._versions,
+            "weights.skipped": self._skipped,
             "refused": self._writer.refused,
             **lost,
         }
@@ -114,7 +118,8 @@ class Recorder:
         lost = self._tap.lost.total() + self._writer.refused
         return (
             f"{time.monotonic() - self._started_s:.0f} s, {self._writer.messages} messages "
-            f"({lost} lost), {self._versions} versions of the weights, "
+            f"({lost} lost), {self._versions} versions of the weights "
+            f"({self._skipped} skipped), "
             f"{self._writer.size / MIB:.1f} MiB"
         )
 
@@ -123,5 +128,6 @@ class Recorder:
             self._writer.add(heard)
         version, data = self._fetcher.newest
         if version > self._version:
+            self._skipped += version - self._version - 1 if self._version else 0
             self._writer.add_weights(version, data, time.time_ns())
             self._version, self._versions = version, self._versions + 1

@@ -18,6 +18,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -34,6 +35,8 @@ EPISODES, MORE = 20, 5
 """Episodes before the first kill, and after each."""
 PATIENCE_S = 600.0
 """Longest wait for any one thing; machines that do other things are slow."""
+BUILD_S = 3600.0
+"""Longest time to make base image and images, which may have to fetch gigabytes."""
 SETTINGS = {
     "BASE_IMAGE": BASE_IMAGE,
     "COMPOSE_PROFILES": "sim",
@@ -51,6 +54,14 @@ class Failed(Exception):
     """What was expected and what came, in one line."""
 
 
+def has_compose_v2() -> bool:
+    """Whether Docker is there and knows `docker compose`."""
+    if shutil.which(DOCKER) is None:
+        return False
+    done = subprocess.run([DOCKER, "compose", "version"], capture_output=True, timeout=PATIENCE_S)
+    return done.returncode == 0
+
+
 class Trial:
     """One run of the system under Compose, and what was found out about it."""
 
@@ -60,8 +71,7 @@ class Trial:
             **{k: v for k, v in os.environ.items() if not k.startswith(("CORRIDOR_", "COMPOSE_"))},
             **SETTINGS,
         }
-        v2 = subprocess.run([DOCKER, "compose", "version"], capture_output=True).returncode == 0
-        self._compose = [DOCKER, "compose"] if v2 else ["docker-compose"]
+        self._compose = [DOCKER, "compose"] if has_compose_v2() else ["docker-compose"]
         self.passed: list[str] = []
 
     # ---------------------------------------------------------------- commands
@@ -78,6 +88,8 @@ class Trial:
                 text=True,
                 timeout=timeout_s,
             )
+        except FileNotFoundError as error:
+            raise Failed(f"missing: {command[0]}") from error
         except subprocess.TimeoutExpired as error:
             raise Failed(f"{' '.join(command)[:200]}: not done after {timeout_s:.0f} s") from error
         if check and done.returncode != 0:
@@ -86,7 +98,16 @@ class Trial:
 
     def show(self, *command: str) -> None:
         """Run a command and let it print; for what takes minutes."""
-        done = subprocess.run(command, cwd=ROOT, env=self._environment, stdin=subprocess.DEVNULL)
+        try:
+            done = subprocess.run(
+                command,
+                cwd=ROOT,
+                env=self._environment,
+                stdin=subprocess.DEVNULL,
+                timeout=BUILD_S,
+            )
+        except subprocess.TimeoutExpired as error:
+            raise Failed(f"{' '.join(command)}: not done after {BUILD_S:.0f} s") from error
         if done.returncode != 0:
             raise Failed(f"{' '.join(command)}: exit code {done.returncode}")
 
@@ -97,7 +118,7 @@ class Trial:
 
     def container(self, service: str) -> dict[str, Any]:
         """What Docker knows of the container of a service. Raises Failed when there is none."""
-        ident = self.compose("ps", "-q", service).strip()
+        ident = self.compose("ps", "-a", "-q", service).strip()
         if not ident:
             raise Failed(f"{service} has no container")
         found: dict[str, Any] = json.loads(self.run(DOCKER, "inspect", ident))[0]
@@ -145,19 +166,24 @@ class Trial:
 
     def build(self) -> None:
         """Make every image, of robots that are not there too."""
-        if subprocess.run([DOCKER, "info"], capture_output=True).returncode != 0:
-            raise Failed("no Docker engine answers `docker info`")
-        if not self.run(DOCKER, "images", "-q", BASE_IMAGE).strip():
-            pulled = subprocess.run([DOCKER, "pull", BASE_IMAGE], capture_output=True, timeout=300)
-            if pulled.returncode != 0:
-                self.tell("no image registry in reach: the base image is made of Debian packages")
-                self.show("deploy/make-base-image.sh", BASE_IMAGE)
+        self.run(DOCKER, "info")
+        if not self.run(DOCKER, "images", "-q", BASE_IMAGE).strip() and not self.pulled():
+            self.tell("no image registry in reach: the base image is made of Debian packages")
+            self.show("deploy/make-base-image.sh", BASE_IMAGE)
         self._environment["PYTHON"] = sys.executable
         files = [word for name in FILES for word in ("-f", name)]
         self.show("deploy/build-images.sh", *files, *IMAGES)
         self.found("images are built")
         for name, size in self.sizes().items():
             self.tell(f"    {name:24} {size / 1e6:6.0f} MB")
+
+    def pulled(self) -> bool:
+        """Whether a registry gave the base image."""
+        try:
+            done = subprocess.run([DOCKER, "pull", BASE_IMAGE], capture_output=True, timeout=300)
+        except subprocess.TimeoutExpired:
+            return False
+        return done.returncode == 0
 
     def sizes(self) -> dict[str, int]:
         """Bytes of every image."""
@@ -197,7 +223,7 @@ class Trial:
     def kill(self, service: str) -> None:
         """Kill one container; it comes back, episodes go on, those before are still the same."""
         restarts = self.container(service)["RestartCount"]
-        before = self.rows()
+        before = self.episodes(EPISODES)
         self.compose("exec", "-T", service, "python", "-c", KILL, check=False)
 
         def back() -> bool:
@@ -255,7 +281,6 @@ class Trial:
     def down(self) -> None:
         """Remove containers, network and volumes; images stay for the next time."""
         self.compose("down", "--volumes", "--remove-orphans", "--timeout", "20", check=False)
-        self.run(DOCKER, "image", "prune", "--force", check=False)  # of code that changed
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -277,12 +302,17 @@ def main(arguments: Sequence[str]) -> int:
     except Failed as error:
         failure = str(error)
         trial.tell(f"FAILED: {failure}")
-        trial.last_words()
+        with suppress(Failed):
+            trial.last_words()
     except KeyboardInterrupt:
         failure = "interrupted"
     finally:
-        trial.down()
-    trial.tell("everything is down")
+        try:
+            trial.down()
+            trial.tell("everything is down")
+        except Failed as error:
+            failure = failure or str(error)
+            trial.tell(f"FAILED to take everything down: {error}")
     sys.stdout.write(f"compose-test: {len(trial.passed)} passed, {int(bool(failure))} failed\n")
     return 1 if failure else 0
 

@@ -12,6 +12,7 @@ from waiting import wait_until
 
 from services.robot_driver.emulation.faults import Faults
 from services.robot_driver.emulation.robotino import RobotinoServer
+from services.robot_driver.emulation.ros2_faults import Ros2Faults
 from services.robot_driver.replies import BadReply, camera, jpeg_size, odometry
 from shared.errors import ConfigError
 
@@ -67,6 +68,7 @@ def test_whole_numbers_are_integers(client: Client) -> None:
     [
         b"", b"[]", b"[0,0]", b"[0,0,0,0]", b"{}", b"[0,0,true]", b'[0,0,"1"]', b"[NaN,0,0]",
         b"[2.1,0,0]", b"[0,-2.1,0]", b"[0,0,3.1]", b"[1e999,0,0]", b"[" * 3000,
+        b"[" + b"9" * 1000 + b",0,0]",
     ],
 )  # fmt: skip
 def test_commands_out_of_range_are_refused_and_not_cut(body: bytes, client: Client) -> None:
@@ -142,7 +144,7 @@ def test_silence_is_silence(client: Client) -> None:
 
 
 @pytest.mark.parametrize(
-    "body", [b"", b"[]", b'{"camera": "blue"}', b'{"nothing": 1}', b'{"stall_s": -1}']
+    "body", [b"", b"[]", b'{"camera": "blue"}', b'{"nothing": 1}', b'{"stall_s": -1}', b"[" * 3000]
 )
 def test_unknown_faults_are_refused_and_change_nothing(body: bytes, client: Client) -> None:
     before = client.get("/emulator/faults").json()
@@ -154,6 +156,8 @@ def test_faults_as_texts() -> None:
     texts = ["camera=frozen", "battery_low=true", "stall_s=0.5"]
     faults = Faults().with_texts(texts)
     assert (faults.camera, faults.battery_low, faults.stall_s) == ("frozen", True, 0.5)
+    assert faults.with_texts(["camera=", "battery_low=", "stall_s="]) == Faults()
+    assert Ros2Faults(payload_of="camera").with_texts(["payload_of="]) == Ros2Faults()
     for bad in (["camera"], ["camera=blue"], ["x=1"]):
         with pytest.raises(ValueError, match=r"NAME=VALUE|camera|x"):
             Faults().with_texts(bad)

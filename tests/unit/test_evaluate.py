@@ -120,6 +120,9 @@ def test_wrong_runs_are_refused_in_one_line(
     assert "expected float32 [" in other, "the first tensor that differs"
     (run / "weights.safetensors").write_bytes(WEIGHTS[:-9])
     assert "damaged weights" in refused(capsys, 3, run, *out)
+    for state in ("[]", '{"counters": 1}'):
+        save_file({"something": torch.zeros(3)}, run / "weights.safetensors", {"state": state})
+        assert "damaged weights" in refused(capsys, 3, run, *out)
     save_file({"something": torch.zeros(3)}, run / "weights.safetensors")
     assert "differs in" in refused(capsys, 2, run, *out)
     assert not (tmp_path / "out").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections.abc import Callable
 from contextlib import suppress
@@ -322,6 +323,41 @@ def test_damaged_weights_are_refused(tmp_path: Path, turns: Any) -> None:
         writer.add_weights(2, WEIGHTS[2][:-8], 0)
     with pytest.raises(StateError, match="recorded weights of version 2"):
         playback.compare(Recording(path))
+
+
+def test_weights_that_changed_on_disk_are_refused(whole: Path, tmp_path: Path) -> None:
+    data = bytearray(whole.read_bytes())
+    data[data.index(WEIGHTS[2]) + len(WEIGHTS[2]) - 5] ^= 1
+    path = tmp_path / "f.mcap"
+    path.write_bytes(data)
+    recording = Recording(path)
+    assert recording.load(recording.weights[1]) == WEIGHTS[1]
+    with pytest.raises(StateError, match="weights 2 do not match their checksum"):
+        recording.load(recording.weights[2])
+
+
+def test_lengths_that_no_file_has_are_refused(whole: Path, tmp_path: Path) -> None:
+    data = bytearray(whole.read_bytes())
+    length = data.index(WEIGHTS[1]) - 8
+    data[length : length + 8] = (2**63).to_bytes(8, "little")
+    path = tmp_path / "f.mcap"
+    path.write_bytes(data)
+    with pytest.raises(StateError, match="damaged"):
+        Recording(path)
+
+
+def test_a_recording_that_failed_does_not_look_complete(tmp_path: Path, turns: Any) -> None:
+    path = tmp_path / "f.mcap"
+    with (
+        contextlib.suppress(OSError),
+        RecordingWriter(path, Origin(CONFIG, NUMERICS)) as writer,
+    ):
+        writer.add(heard(turns[0][0]))
+        writer.flush()
+        raise OSError("full")
+    recording = Recording(path)
+    assert not recording.complete
+    assert len(list(recording.messages())) == 1
 
 
 def test_numerics_come_from_the_run_folder(tmp_path: Path) -> None:

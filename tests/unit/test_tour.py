@@ -79,6 +79,9 @@ def test_bumps_are_counted_and_told_and_the_box_is_taken_away(env: CorridorEnv) 
     told = [event.text for event in tour.route.events]
     assert tour.bumps == told.count("bumps") > 0
     assert [event.number for event in tour.route.events] == list(range(1, len(told) + 1))
+    ways_m = tour.route.trace.way_m[tour.route.trace.bumps]  # without the way back from the wall
+    robot = env.config.robot
+    assert ways_m.max() <= robot.speed_m_s * robot.period_s + 1e-6
     assert BOX_NAME not in [obstacle.name for obstacle in env.robot.obstacles]
     assert not tour.passed
 

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 
 from services.robot_driver.emulation.dynamics import ROBOTINO
-from shared.codec import first_problem
+from services.robot_driver.emulation.fault_set import FaultSet
 
 
-class Faults(BaseModel):
+class Faults(FaultSet):
     """What is wrong with the robot or with the way to it. Frozen; the defaults are a sound one."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     bumper: Literal["", "stuck", "unreadable", "nonsense"] = ""
     """stuck: pressed; unreadable: status 500; nonsense: an object without the value."""
@@ -31,22 +29,3 @@ class Faults(BaseModel):
     """As old images do: POST is answered and does nothing, PUT works."""
     watchdog_s: float = Field(default=ROBOTINO.watchdog_s, gt=0.0, le=5.0)
     """Of the base: 0.2 s as documented, 0.5 s as in older sources."""
-
-    def changed(self, changes: object) -> Faults:
-        """These with some values replaced. Raises ValueError in one line."""
-        if not isinstance(changes, dict):
-            raise ValueError("expected an object of faults")
-        try:
-            return Faults.model_validate({**self.model_dump(), **changes})
-        except ValidationError as error:
-            raise ValueError(first_problem(error)) from error
-
-    def with_texts(self, items: list[str]) -> Faults:
-        """These with `name=value` texts applied. Raises ValueError in one line."""
-        changes = {}
-        for item in items:
-            name, equals, value = item.partition("=")
-            if not equals:
-                raise ValueError(f"expected NAME=VALUE, got {item!r}")
-            changes[name] = value
-        return self.changed(changes)

@@ -33,6 +33,8 @@ WIDTH, HEIGHT = 800, 600
 QUALITY = 80
 VERTICAL_FOV_DEG = 43.0
 COLD_S = 10.0
+SILENT_S = 10.0
+"""Longest that a request is left without an answer; then its connection is closed."""
 """Without a request for this long the camera is let go: the next one finds none."""
 MAX_BODY = 4096
 SPEED_LIMIT_M_S, TURN_LIMIT_RAD_S = 2.0, 3.0
@@ -214,7 +216,7 @@ class Handler(BaseHTTPRequestHandler):
     def _changed(self, body: bytes) -> Reply:
         try:
             return _json(self.robotino.change(body).model_dump())
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             return HTTPStatus.BAD_REQUEST, "text/plain", str(error).encode()
 
     def _reachable(self) -> bool:
@@ -222,8 +224,10 @@ class Handler(BaseHTTPRequestHandler):
         faults = self.robotino.faults
         if faults.stall_s:
             time.sleep(faults.stall_s)
-        while self.robotino.faults.network == "silent":
+        end_s = time.monotonic() + SILENT_S  # by then nobody waits any more
+        while self.robotino.faults.network == "silent" and time.monotonic() < end_s:
             time.sleep(STEP_S)
+        faults = self.robotino.faults if faults.network == "silent" else faults
         if not faults.network:
             return True
         self.close_connection = True
@@ -299,11 +303,16 @@ def _velocity(values: object) -> Velocity:
     """The velocity in `[vx, vy, omega]`. Raises ValueError beyond what the server accepts."""
     numbers = isinstance(values, list) and len(values) == 3
     if not numbers or any(
-        isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value)
+        isinstance(value, bool) or not isinstance(value, (int, float))
         for value in values  # type: ignore[attr-defined]
     ):
         raise ValueError("expected an array of three numbers")
-    forward, left, turn = (float(value) for value in values)  # type: ignore[attr-defined]
+    try:
+        forward, left, turn = (float(value) for value in values)  # type: ignore[attr-defined]
+    except OverflowError as error:
+        raise ValueError("velocity out of range") from error
+    if not all(math.isfinite(value) for value in (forward, left, turn)):
+        raise ValueError("expected an array of three numbers")
     if max(abs(forward), abs(left)) > SPEED_LIMIT_M_S or abs(turn) > TURN_LIMIT_RAD_S:
         raise ValueError("velocity out of range")
     return Velocity(forward, left, turn)

@@ -25,14 +25,14 @@ import numpy as np
 from services.robot_driver import cdr, ros2_names
 from services.robot_driver.cdr import VelocityType
 from services.robot_driver.emulation.dynamics import CREATE3, ROBOTINO, STEP_S
-from services.robot_driver.emulation.ros2_faults import Ros2Faults
-from services.robot_driver.emulation.ros2_network import FAULTS_KEY, TRUTH_KEY, Network
+from services.robot_driver.emulation.ros2_faults import TRUTH_KEY, Ros2Faults
+from services.robot_driver.emulation.ros2_network import Network
 from services.robot_driver.emulation.world import EmulatedRobot
 from services.robot_driver.link import Battery
 from services.robot_driver.picture import RgbImage
 from shared.config import RobotConfig
 from shared.errors import BadMessage, ConfigError, RouterMissing
-from shared.foreign_bus import ForeignBus, RawInbox, RawSample
+from shared.foreign_bus import RawInbox, RawSample
 
 PERIODS_S = {"odometry": 0.05, "camera": 0.1, "bumper": 0.05, "battery": 0.5}
 DUPLICATE_S = 1.0
@@ -324,26 +324,3 @@ def run(
         stop.wait()
     finally:
         emulated.close()
-
-
-def change_faults(endpoint: str, items: list[str]) -> str:
-    """Change faults of a running emulator by `name=value` texts; returns them as JSON.
-
-    Raises:
-        ConfigError: A wrong name or value, or no emulator there.
-        RouterMissing: Nothing answers at the endpoint.
-    """
-    changes = {}
-    for item in items:
-        name, equals, value = item.partition("=")
-        if not equals:
-            raise ConfigError(f"expected NAME=VALUE, got {item!r}")
-        changes[name] = value
-    bus = ForeignBus(endpoint)
-    try:
-        answer = bus.ask(FAULTS_KEY, json.dumps(changes).encode())
-    finally:
-        bus.close()
-    if answer is None:
-        raise ConfigError(f"no emulated robot answers at {endpoint}")
-    return answer.decode()

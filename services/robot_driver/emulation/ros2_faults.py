@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import json
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 
 from services.robot_driver.emulation.dynamics import CREATE3
-from shared.codec import first_problem
+from services.robot_driver.emulation.fault_set import FaultSet, texts
+from shared.errors import ConfigError
+from shared.foreign_bus import ForeignBus
+
+FAULTS_KEY, TRUTH_KEY = "emulator/faults", "emulator/truth"
+"""On the robot's network, for tests: faults, changed by a JSON object, and what it really does."""
 
 
-class Ros2Faults(BaseModel):
+class Ros2Faults(FaultSet):
     """What is wrong with the robot or with the way to it. Frozen; the defaults are a sound one."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     nobody_listens: bool = False
     """No node of the base takes velocities."""
@@ -38,21 +42,23 @@ class Ros2Faults(BaseModel):
     watchdog_s: float = Field(default=CREATE3.watchdog_s, gt=0.0, le=5.0)
     """Of the base."""
 
-    def changed(self, changes: object) -> Ros2Faults:
-        """These with some values replaced. Raises ValueError in one line."""
-        if not isinstance(changes, dict):
-            raise ValueError("expected an object of faults")
-        try:
-            return Ros2Faults.model_validate({**self.model_dump(), **changes})
-        except ValidationError as error:
-            raise ValueError(first_problem(error)) from error
 
-    def with_texts(self, items: list[str]) -> Ros2Faults:
-        """These with `name=value` texts applied. Raises ValueError in one line."""
-        changes = {}
-        for item in items:
-            name, equals, value = item.partition("=")
-            if not equals:
-                raise ValueError(f"expected NAME=VALUE, got {item!r}")
-            changes[name] = value
-        return self.changed(changes)
+def change_faults(endpoint: str, items: list[str]) -> str:
+    """Change faults of a running emulator by `name=value` texts; returns them as JSON.
+
+    Raises:
+        ConfigError: A wrong name or value, or no emulator there.
+        RouterMissing: Nothing answers at the endpoint.
+    """
+    try:
+        changes = texts(items)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    bus = ForeignBus(endpoint)
+    try:
+        answer = bus.ask(FAULTS_KEY, json.dumps(changes).encode())
+    finally:
+        bus.close()
+    if answer is None:
+        raise ConfigError(f"no emulated robot answers at {endpoint}")
+    return answer.decode()

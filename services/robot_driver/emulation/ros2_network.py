@@ -8,11 +8,11 @@ from typing import Literal
 
 from services.robot_driver import cdr, ros2_names
 from services.robot_driver.cdr import VelocityType
+from services.robot_driver.emulation.ros2_faults import FAULTS_KEY, TRUTH_KEY
 from services.robot_driver.ros2_names import Attachment, Endpoint
 from shared.config import Ros2Config
 from shared.foreign_bus import ForeignBus, RawInbox, RawPublisher, Undeclare
 
-FAULTS_KEY, TRUTH_KEY = "emulator/faults", "emulator/truth"
 SENSORS = ("odometry", "camera", "bumper", "battery")
 
 
