@@ -14,7 +14,7 @@ from experiments.references import reference
 from experiments.tour import Tour, drive_tour
 from experiments.traces import Figures, first_lap
 from services.robot_driver.robot import Pose
-from shared.config import Config
+from shared.config import Config, PolicyConfig
 from shared.rl.predictor import Predictor
 
 LAP_ACTIONS = 400
@@ -54,14 +54,14 @@ class Observer:
         """Pictures of a world, and what is predicted for them."""
         return probes.look(self._env(world).robot, self._network)
 
-    def tours(self, world: str, count: int) -> list[Tour]:
+    def tours(self, world: str, count: int, policy: PolicyConfig) -> list[Tour]:
         """Test drives from the world's first start poses. Raises ValueError without a route."""
         env = self._env(world)
         poses = [
             Pose(start.x_m, start.y_m, math.radians(start.heading_deg))
             for start in env.robot.world.starts[:count]
         ]
-        return [drive_tour(env, self._network, pose, n) for n, pose in enumerate(poses)]
+        return [drive_tour(env, self._network, pose, n, policy) for n, pose in enumerate(poses)]
 
     def reference(self, world: str, driver: str, starts: int, actions: int, kept: Path) -> Figures:
         """Figures of the floor or the ceiling (`references.reference`)."""

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from shared.config import Config, Name, Section
+from shared.config import Config, Name, PolicyConfig, Section
 from shared.errors import ConfigError
 from shared.settings import preset_tree
 
@@ -96,6 +96,8 @@ class Plan(Section):
     stages: Annotated[tuple[Stage, ...], Field(strict=False)] = ()
     tours: Annotated[int, Field(ge=0, le=100)] = 0
     """Test drives with turns on the spot at the end, one from each of the world's first starts."""
+    tour_policy: PolicyConfig = PolicyConfig(kind="eps-greedy", epsilon=0.0)
+    """How actions are chosen on them (E33): greedily, or with some chance of what seems as good."""
     seeds: Annotated[tuple[int, ...], Field(min_length=1, strict=False)] = (1, 2, 3, 4, 5)
     """Fixed before any run: a comparison takes the first so many of them."""
     evaluation: Evaluation = Evaluation()

@@ -272,7 +272,8 @@ class Run:
         """Test drives with turns on the spot (A45): their routes, and `tours.json` about all."""
         self._show()
         told = []
-        tours = self._observer.tours(self._loop.config.robot.world, self.plan.tours)
+        world = self._loop.config.robot.world
+        tours = self._observer.tours(world, self.plan.tours, self.plan.tour_policy)
         for number, tour in enumerate(tours):
             routes.write(self.folder / f"route-tour-{number}.npz", tour.route)
             told.append(tour.told)

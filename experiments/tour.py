@@ -1,7 +1,8 @@
 """The test drive through I16c: image only, with rotation in place (A45, Fig 4.20, E33).
 
-The network is frozen and acts greedily, turning on the spot where it predicts nothing good
-(`shared.rl.spot_turns`). At a junction towards the end a box is dropped in front of the robot.
+The network is frozen and acts greedily unless told otherwise, turning on the spot where it predicts
+nothing good (`shared.rl.spot_turns`). At a junction towards the end a box is dropped in front of
+the robot.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from experiments.routes import Event, Route
 from experiments.traces import Trace
 from services.robot_driver.robot import Pose
 from services.robot_driver.world import World
+from shared.config import PolicyConfig
 from shared.messages import Box, Observation, WorldChange, image_array
 from shared.rl.draws import generator
 from shared.rl.policy import choose
@@ -104,6 +106,7 @@ def drive_tour(
     network: Predicts,
     pose: Pose,
     number: int,
+    policy: PolicyConfig = GREEDY,
     most_driven: int = MOST_DRIVEN,
 ) -> Tour:
     """One test drive from a pose, in a world with a route: until it is full, or given up.
@@ -112,7 +115,8 @@ def drive_tour(
         env: Its obstacles stay as they were found: the box is taken away again.
         network: Frozen.
         pose: Where to begin, standing.
-        number: Seeds draws between equal predictions, and recoveries.
+        number: Seeds draws of the policy, and recoveries.
+        policy: How actions are chosen.
         most_driven: Driven actions after which a tour that is not full is given up; it is too
             after four times as many with the turns on the spot.
 
@@ -136,7 +140,7 @@ def drive_tour(
             dropped, dropped_at = _drop_box(env, log), driven
             observation = env.observe()
         values = network.all_values(image_array(observation.image)[None])[0]
-        action, _ = choose(values, GREEDY, draw)
+        action, _ = choose(values, policy, draw)
         if side := spot_turns.decide(values, action):
             if driven > turned_at + ONE_TURN:
                 log.tell(f"turns {side} on the spot")

@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
+from experiments.choosers import GREEDY
 from experiments.environment import CorridorEnv
 from experiments.tour import BOX_NAME, drive_tour, route_share
 from services.robot_driver.robot import Pose
 from services.robot_driver.world import load_world
-from shared.config import Config
+from shared.config import Config, PolicyConfig
 
 Values = tuple[float, float, float]
 
@@ -55,7 +56,7 @@ def test_a_negative_prediction_turns_on_the_spot_in_one_direction_until_it_is_no
             return (-0.5, -0.1, -0.5) if sense < 0.0 else (-0.5, -0.5, -0.1)
         return (0.0, -0.5, -0.5)
 
-    tour = drive_tour(env, Scripted(rule), START, 0, MOST)
+    tour = drive_tour(env, Scripted(rule), START, 0, most_driven=MOST)
     headings = np.unwrap(tour.route.trace.headings_rad[:4])
     turn = env.config.robot.turn_rad_s * env.config.robot.period_s
     np.testing.assert_allclose(np.diff(headings), [sense * turn, sense * turn, 0.0], atol=1e-9)
@@ -66,7 +67,7 @@ def test_a_negative_prediction_turns_on_the_spot_in_one_direction_until_it_is_no
 
 
 def test_a_robot_that_finds_no_way_out_drives_on_after_two_full_turns(env: CorridorEnv) -> None:
-    tour = drive_tour(env, Scripted(lambda _: (-0.1, -0.5, -0.5)), START, 0, MOST)
+    tour = drive_tour(env, Scripted(lambda _: (-0.1, -0.5, -0.5)), START, 0, most_driven=MOST)
     turn = np.rad2deg(env.config.robot.turn_rad_s * env.config.robot.period_s)
     per_drive = int(np.ceil(720.0 / turn))
     assert tour.turned == pytest.approx(per_drive * tour.driven, abs=per_drive)
@@ -75,7 +76,7 @@ def test_a_robot_that_finds_no_way_out_drives_on_after_two_full_turns(env: Corri
 
 
 def test_bumps_are_counted_and_told_and_the_box_is_taken_away(env: CorridorEnv) -> None:
-    tour = drive_tour(env, Scripted(lambda _: (1.0, 0.0, 0.0)), START, 0, MOST)
+    tour = drive_tour(env, Scripted(lambda _: (1.0, 0.0, 0.0)), START, 0, most_driven=MOST)
     told = [event.text for event in tour.route.events]
     assert tour.bumps == told.count("bumps") > 0
     assert [event.number for event in tour.route.events] == list(range(1, len(told) + 1))
@@ -84,6 +85,17 @@ def test_bumps_are_counted_and_told_and_the_box_is_taken_away(env: CorridorEnv) 
     assert ways_m.max() <= robot.speed_m_s * robot.period_s + 1e-6
     assert BOX_NAME not in [obstacle.name for obstacle in env.robot.obstacles]
     assert not tour.passed
+
+
+def test_a_policy_may_choose_what_seems_as_good(env: CorridorEnv) -> None:
+    """E33: roulette turns aside where forward is hardly better; greedily it never does."""
+    ways = []
+    for policy in (GREEDY, PolicyConfig(kind="roulette", temperature=0.5)):
+        network = Scripted(lambda _: (0.31, 0.3, 0.3))
+        tour = drive_tour(env, network, START, 0, policy, most_driven=20)
+        ways.append(np.unwrap(tour.route.trace.headings_rad[:6]))
+    assert np.ptp(ways[0]) < 1e-6
+    assert np.ptp(ways[1]) > 0.01
 
 
 def test_the_share_of_the_route_is_that_of_its_length() -> None:
