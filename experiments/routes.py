@@ -162,14 +162,15 @@ def gathered(trace: Trace, events: Sequence[Event]) -> list[tuple[tuple[float, f
 
 
 def ranges(numbers: Sequence[int]) -> str:
-    """Ascending numbers, neighbours as one: "3, 5-7"."""
+    """Ascending numbers, neighbours as one, no more than three: "3, 5-7", "1, 3, 5 ..."."""
     parts: list[list[int]] = []
     for number in numbers:
         if parts and number == parts[-1][-1] + 1:
             parts[-1] = [parts[-1][0], number]
         else:
             parts.append([number])
-    return ", ".join("-".join(map(str, part)) for part in parts)
+    told = ", ".join("-".join(map(str, part)) for part in parts[:3])
+    return f"{told} ..." if len(parts) > 3 else told
 
 
 def bump_places(trace: Trace) -> npt.NDArray[np.float64]:

@@ -99,7 +99,13 @@ def test_events_stand_as_numbers_on_the_map() -> None:
 
 @pytest.mark.parametrize(
     ("numbers", "text"),
-    [([], ""), ([3], "3"), ([3, 4], "3-4"), ([1, 3, 4, 5, 9], "1, 3-5, 9")],
+    [
+        ([], ""),
+        ([3], "3"),
+        ([3, 4], "3-4"),
+        ([1, 3, 4, 5, 9], "1, 3-5, 9"),
+        ([1, 3, 5, 7], "1, 3, 5 ..."),
+    ],
 )
 def test_neighbouring_numbers_are_told_as_one(numbers: list[int], text: str) -> None:
     assert routes.ranges(numbers) == text
