@@ -275,6 +275,23 @@ def test_a_bump_whose_recovery_is_cut_short_is_still_told(
     assert (seen.sequence, seen.bump) == (1, True)
 
 
+def test_a_bump_as_it_becomes_unfit_is_counted_and_not_recovered_from(
+    robot: HardwareRobot, link: FakeLink
+) -> None:
+    driver = Driver(config_of(), robot, "a" * 12)
+    driver.start(0)
+    moves(link)
+    link.pressed = True
+    stops(link)
+    link.low = True
+    wait_until(lambda: link.battery.get().value.low, 20, "a low battery")  # type: ignore[union-attr]
+    with pytest.raises(NotReady, match="battery") as caught:
+        driver.advance(20.0)
+    assert caught.value.contact
+    driver.block(str(caught.value), bump=caught.value.contact)
+    assert (driver.bumps, driver.recoveries) == (1, 0)
+
+
 def test_a_restarted_driver_of_a_real_robot_tells_of_it(robot: HardwareRobot) -> None:
     driver = Driver(config_of(), robot, "a" * 12)
     saved = driver.saved()
