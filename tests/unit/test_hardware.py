@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from waiting import wait_until
 
-from services.robot_driver.driver import Driver
+from services.robot_driver.driver import Driver, action_velocity
 from services.robot_driver.gate import ZEROS
 from services.robot_driver.hardware import HardwareRobot
 from services.robot_driver.link import Battery, Newest
@@ -280,7 +280,7 @@ def test_a_bump_as_it_becomes_unfit_is_counted_and_not_recovered_from(
 ) -> None:
     driver = Driver(config_of(), robot, "a" * 12)
     driver.start(0)
-    moves(link)
+    moves(link, action_velocity(config_of(), 0))
     link.pressed = True
     stops(link)
     link.low = True
