@@ -44,6 +44,8 @@ def test_zenoh_is_imported_by_our_bus_and_by_that_to_foreign_networks() -> None:
     assert importers("shared.foreign_bus") == {
         "services/robot_driver/ros2.py",
         "services/robot_driver/emulation/ros2.py",
+        "services/robot_driver/emulation/ros2_faults.py",
+        "services/robot_driver/emulation/ros2_network.py",
     }
 
 

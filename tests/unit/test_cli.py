@@ -87,7 +87,8 @@ def test_without_arguments_the_help_is_shown(capsys: pytest.CaptureFixture[str])
         (("up", "--endpoint", "tcp/127.0.0.1:1", "--listen", "tcp/127.0.0.1:2"), "--listen"),
         (("up", "--listen", "tcp/127.0.0.1:0"), "--listen: expected a fixed port"),
         (("router", "--listen", "tcp/127.0.0.1:99999"), "router: cannot listen on"),
-        (("router", "--listen", "nonsense"), "router: cannot listen on"),
+        (("router", "--listen", "tcp/nonsense"), "router: cannot listen on"),
+        (("router", "--listen", "nonsense"), "bus.endpoint: expected a text to match pattern"),
         (("estop", "--robot", "a/b"), "--robot: expected a name"),
     ],
 )

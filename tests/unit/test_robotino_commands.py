@@ -49,11 +49,16 @@ def server(head: bytes, piece: bytes) -> Iterator[str]:
                 thread.join()
 
 
+def link_to(address: str) -> RobotinoLink:
+    slow = {"address": address, "timeout_s": 2.0}
+    return RobotinoLink(config_of(robotino=slow, hardware={"command_period_s": 0.5}))
+
+
 @pytest.mark.parametrize("piece", [b"x", b"x" * 65536], ids=["trickle", "flood"])
 def test_an_answer_that_does_not_end_holds_up_no_command(piece: bytes) -> None:
     head = b"HTTP/1.1 200 OK\r\nContent-Length: 1000000000\r\n\r\n"
     with server(head, piece) as address:
-        link = RobotinoLink(config_of(robotino={"address": address}))
+        link = link_to(address)
         for _ in range(3):
             link.send(STANDSTILL)
         link.close()
@@ -62,7 +67,7 @@ def test_an_answer_that_does_not_end_holds_up_no_command(piece: bytes) -> None:
 
 def test_a_status_that_is_no_success_is_told() -> None:
     with server(b"HTTP/1.1 503 Busy\r\nContent-Length: 0\r\n\r\n", b"") as address:
-        link = RobotinoLink(config_of(robotino={"address": address}))
+        link = link_to(address)
         with pytest.raises(RobotFault, match="command: status 503"):
             link.send(STANDSTILL)
         link.close()
@@ -70,7 +75,7 @@ def test_a_status_that_is_no_success_is_told() -> None:
 
 def test_no_answer_is_a_timeout() -> None:
     with server(b"", b"") as address:
-        link = RobotinoLink(config_of(robotino={"address": address}))
+        link = link_to(address)
         with pytest.raises(RobotFault, match="command: timeout"):
             link.send(STANDSTILL)
         link.close()
