@@ -263,7 +263,10 @@ def planned(words: Sequence[str]) -> Plan:
             "numerics": {"learner": {"threads": given.threads}},
         }
     )
-    command = shlex.join(["python", "-m", "experiments.baseline_dqn", *words])
+    told = list(words)  # without where to: a place on this machine, and no part of what was run
+    if "--out" in told:
+        del told[told.index("--out") : told.index("--out") + 2]
+    command = shlex.join(["python", "-m", "experiments.baseline_dqn", *told])
     factors = (like.mini.factor, like.mini.memories_by) if given.scale == "mini" else (1, 1)
     return Plan(
         config, given.scale, *factors, given.actions,
