@@ -57,10 +57,16 @@ def test_asynchronous_robot_waits_for_a_learner_too_far_behind(
             return any(s.phase == "training" for _, s in inbox.take(ACTOR_STATE, ActorState))
 
         cluster.wait(waits, 60, "the actor waits for the learner")
-        learner, replay = cluster.learner(), cluster.replay()
+        learner = cluster.learner()
         assert learner is not None
+
+        def at_the_limit() -> bool:  # each tells of itself a little later
+            replay = cluster.replay()
+            return replay is not None and replay.episode - learner.episode == lag + 1
+
+        cluster.wait(at_the_limit, 60, "replay to be as far ahead as it may be")
+        replay = cluster.replay()
         assert replay is not None
-        assert replay.episode - learner.episode == lag + 1
         cluster.thaw("learner")
         cluster.wait_episodes(replay.episode + 5, 60)
         cluster.stop_all()
