@@ -51,7 +51,7 @@ system: $(VENV)/.dev ## tests with real processes and a real router, without the
 	$(PYTEST) -m "not slow" tests/system tests/learning
 
 compose-test: $(VENV)/.made ## images and containers, with kills; needs a Docker engine (docs/compose.md)
-	$(BIN)/python tests/compose/trial.py $(ARGS)
+	$(BIN)/python -m tests.compose.trial $(ARGS)
 
 bench: $(VENV)/.dev ## measure speed and memory, in minutes; the machine should do nothing else
 	$(BIN)/python -m benchmarks.run_all --short

@@ -43,8 +43,7 @@ EXPECTED_FEWER_BUMPS = {
 
 
 ENOUGH_SEEDS = 8
-"""Fewer of either make bootstrap intervals far too narrow: drawn from equal groups, 34, 24, 14 and
-13 of 100 intervals of 2, 3, 4 and 5 seeds exclude 0, not 5."""
+"""Fewer of either make bootstrap intervals far too narrow (`tests/unit/test_statistics.py`)."""
 
 
 def _verdict(same: bool) -> str:
@@ -211,7 +210,7 @@ def difference(pair: Compared) -> str:
     few = min(pair.seeds) < ENOUGH_SEEDS
     told += "which excludes 0" if d.sure else "which includes 0: undecided"
     if d.sure and few:
-        told += ", a hint only: of so few seeds one in three or four does by chance"
+        told += ", a hint only: of so few seeds many do by chance"
     better = _expected_better(pair.ours, pair.theirs)
     if better is not None and d.sure and not few:
         told += f"; the thesis holds {better} for the better one: "

@@ -10,7 +10,9 @@ T = TypeVar("T")
 POLL_S = 0.02
 
 
-def wait_until(condition: Callable[[], T], timeout_s: float, what: str) -> T:
+def wait_until(
+    condition: Callable[[], T], timeout_s: float, what: str, poll_s: float = POLL_S
+) -> T:
     """The first true result of `condition`; fails the test naming `what` when none came in time."""
     deadline_s = time.monotonic() + timeout_s
     while True:
@@ -19,4 +21,4 @@ def wait_until(condition: Callable[[], T], timeout_s: float, what: str) -> T:
             return result
         if time.monotonic() > deadline_s:
             raise AssertionError(f"not within {timeout_s} s: {what}")
-        time.sleep(POLL_S)
+        time.sleep(poll_s)

@@ -129,7 +129,7 @@ class HardwareRobot:
             self._check(contact=contact)
             if lapsed:
                 self.drive(STANDSTILL)
-                raise _not_ready("driver: hung for longer than a velocity is leased", contact)
+                raise NotReady("driver: hung for longer than a velocity is leased", contact=contact)
             if left_s <= 0.0:
                 return contact
 
@@ -175,7 +175,7 @@ class HardwareRobot:
                 self._gate.drive(STANDSTILL, self._clock())
                 self._changed.notify_all()
         if problem:
-            raise _not_ready(problem, contact)
+            raise NotReady(problem, contact=contact)
 
     def _problem(self, now_s: float) -> str:
         """Why the robot must not move now; empty when it may."""
@@ -282,12 +282,6 @@ class HardwareRobot:
     def _send_zeros(self) -> None:
         for _ in range(ZEROS):
             self._hand_over(STANDSTILL)
-
-
-def _not_ready(problem: str, contact: bool) -> NotReady:
-    error = NotReady(problem)
-    error.contact = contact
-    return error
 
 
 def _there(reading: Reading[T] | None) -> T:

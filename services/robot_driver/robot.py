@@ -96,5 +96,7 @@ class NotReady(RobotFault):
     The text says why. Once that is over the robot can go on.
     """
 
-    contact = False
-    """Whether it also hit something as it became so."""
+    def __init__(self, reason: str, *, contact: bool = False) -> None:
+        super().__init__(reason)
+        self.contact = contact
+        """Whether it also hit something as it became so."""

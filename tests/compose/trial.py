@@ -22,6 +22,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
+from tests.waiting import wait_until
+
 T = TypeVar("T")
 ROOT = Path(__file__).parents[2]
 DOCKER = shutil.which("docker") or "docker"
@@ -76,15 +78,21 @@ class Trial:
 
     # ---------------------------------------------------------------- commands
 
-    def run(self, *command: str, check: bool = True, timeout_s: float = PATIENCE_S) -> str:
-        """Run a command to its end; returns what it printed. Raises Failed."""
+    def run(
+        self,
+        *command: str,
+        check: bool = True,
+        timeout_s: float = PATIENCE_S,
+        shown: bool = False,
+    ) -> str:
+        """Run a command to its end; returns what it printed, unless `shown`. Raises Failed."""
         try:
             done = subprocess.run(
                 command,
                 cwd=ROOT,
                 env=self._environment,
                 stdin=subprocess.DEVNULL,
-                capture_output=True,
+                capture_output=not shown,
                 text=True,
                 timeout=timeout_s,
             )
@@ -93,23 +101,13 @@ class Trial:
         except subprocess.TimeoutExpired as error:
             raise Failed(f"{' '.join(command)[:200]}: not done after {timeout_s:.0f} s") from error
         if check and done.returncode != 0:
-            raise Failed(f"{' '.join(command)[:200]}: {(done.stderr or done.stdout)[-2000:]}")
-        return done.stdout
+            said = done.stderr or done.stdout or f"exit code {done.returncode}"
+            raise Failed(f"{' '.join(command)[:200]}: {said[-2000:]}")
+        return done.stdout or ""
 
     def show(self, *command: str) -> None:
         """Run a command and let it print; for what takes minutes."""
-        try:
-            done = subprocess.run(
-                command,
-                cwd=ROOT,
-                env=self._environment,
-                stdin=subprocess.DEVNULL,
-                timeout=BUILD_S,
-            )
-        except subprocess.TimeoutExpired as error:
-            raise Failed(f"{' '.join(command)}: not done after {BUILD_S:.0f} s") from error
-        if done.returncode != 0:
-            raise Failed(f"{' '.join(command)}: exit code {done.returncode}")
+        self.run(*command, timeout_s=BUILD_S, shown=True)
 
     def compose(self, *arguments: str, check: bool = True) -> str:
         """Run a command of Compose on our project."""
@@ -136,12 +134,12 @@ class Trial:
 
     def wait(self, condition: Callable[[], T | None], what: str) -> T:
         """Poll until the condition gives something. Raises Failed at the deadline."""
-        deadline_s = time.monotonic() + PATIENCE_S
-        while time.monotonic() < deadline_s:
-            if found := condition():
-                return found
-            time.sleep(1.0)
-        raise Failed(f"{what}: not within {PATIENCE_S:.0f} s")
+        try:
+            found = wait_until(condition, PATIENCE_S, what, poll_s=1.0)
+        except AssertionError as error:
+            raise Failed(str(error)) from error
+        assert found is not None
+        return found
 
     def episodes(self, count: int) -> list[dict[str, str]]:
         """Wait for so many episodes; returns their rows."""

@@ -119,6 +119,18 @@ def test_equal_groups_are_not_sure() -> None:
     assert not result.sure
 
 
+@pytest.mark.parametrize(
+    ("seeds", "least", "most"), [(2, 0.25, 0.45), (3, 0.15, 0.3), (5, 0.08, 0.2), (8, 0.0, 0.13)]
+)
+def test_intervals_of_few_seeds_are_too_narrow(seeds: int, least: float, most: float) -> None:
+    """Of 100 differences between equal groups 5 should be sure; why few seeds are a hint only."""
+    draw = np.random.default_rng(0)
+    sure = [
+        bootstrap_difference(*draw.normal(size=(2, seeds)), draw, 1000).sure for _ in range(600)
+    ]
+    assert least < np.mean(sure) < most
+
+
 def test_one_seed_tells_nothing_about_spread() -> None:
     with pytest.raises(ValueError, match="expected at least 2 seeds each, got 1 and 3"):
         bootstrap_difference(np.ones(1), np.ones(3), np.random.default_rng(1))
