@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 
-from experiments import findings
+from experiments import findings, tables
 from experiments.document import Block, Findings, Missing, Picture, Section, Table
 from experiments.figures import evaluation, probes, progress
 from experiments.measures import (
@@ -45,6 +45,7 @@ EQUAL = (
     ("plus-rmm", "plus-normm"),
     ("plus-rmm", "plus-normm-fit"),
     ("plus-rmm-nopretrain", "plus-normm-fit-alone"),
+    ("plus-rmm", "dqn-distance"),
 )
 """Compared after equally many actions; plus-normm-fit goes on from plus-normm."""
 Named = dict[str, Experiment]
@@ -61,6 +62,7 @@ def compare_all(experiments: Sequence[Experiment]) -> list[Section]:
                 *_policies(named),
                 *_continued(named),
                 *_fitted(named),
+                *_searched(named),
                 *_frozen(named),
                 *_equal(named),
                 *_predictions(named, "plus-rmm", "plus-normm", "4.10", of_best=True),
@@ -140,6 +142,12 @@ def _fitted(named: Named) -> list[Block]:
     )
     picture = Picture(f"{shown[0].scale}-rmm", what, caption, partial(progress.compared, shown))
     return [picture, *_sentences(findings.fitted(shown[:2], shown[2]))]
+
+
+def _searched(named: Named) -> list[Block]:
+    """The variants of the demo side by side, the demo itself first."""
+    shown = [e for name, e in sorted(named.items(), key=_rank) if name.startswith(SEARCH)]
+    return [tables.search(shown)] if len(shown) > 1 else []
 
 
 def _frozen(named: Named) -> list[Block]:

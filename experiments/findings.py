@@ -233,6 +233,21 @@ def drive(trace: Trace, *, of_thesis: bool) -> str:
     return f"{told}, {_verdict(bumps == 0)}." if of_thesis else f"{told}."
 
 
+def tours(experiment: Experiment) -> list[str]:
+    """How many test drives were full and without a bump, as the thesis's was (A45, Fig 4.20)."""
+    told = []
+    for run in experiment.runs:
+        if not run.tours:
+            continue
+        passed = sum(tour.passed for tour in run.tours)
+        clean = sum(not tour.bumps for tour in run.tours) - passed
+        sentence = f"Seed {run.info.seed}: {passed} of {len(run.tours)} test drives were full and "
+        sentence += "without a bump"
+        sentence += f", {clean} had no bump but were not full" if clean else ""
+        told.append(f"{sentence}; the one that the thesis tells of was.")
+    return told
+
+
 def policies(experiments: Sequence[Experiment]) -> list[str]:
     """Whether every eps-greedy policy got farther than every roulette (Fig 4.2)."""
     best = {e.name: of_seeds(e, max_mean_fitness) for e in experiments}

@@ -7,6 +7,7 @@
         evaluations.csv    one row per drive without learning (frozen network, greedy)
         probes-<label>.npz images of a fixed set, and the rewards predicted for them
         route-<label>.npz  the way of one drive
+        tours.json         how every test drive went (A45)
         weights.safetensors, best.safetensors
         state-<stage>/     everything a later stage or experiment goes on from
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from experiments import findings, routes, runs, tables
+from experiments import costs, findings, routes, runs, tables
 from experiments.comparisons import compare_all
 from experiments.document import (
     Block,
@@ -103,7 +103,8 @@ def overview_blocks(
         (*names, "complete", "command", "machine", "commit"),
         tuple(_origin_row(run) for run in every),
     )
-    return (numbers, _costs(experiments, gpu_step_ms), origins)
+    full = costs.full_scale(experiments, gpu_step_ms)
+    return (numbers, _costs(experiments, gpu_step_ms), full, origins)
 
 
 def _number_rows(run: Run) -> list[tuple[str, ...]]:
@@ -284,6 +285,8 @@ def _predictions(experiment: Experiment, kind: str, choice: probes.Choice) -> Pi
 def _routes(experiment: Experiment) -> list[Block]:
     theirs = THESIS_FIGURES.get((experiment.name, "route"))
     blocks: list[Block] = []
+    if told := findings.tours(experiment):
+        blocks += [tables.tours(experiment), Findings(tuple(told))]
     for run in experiment.runs:
         for label, drive in run.routes.items():
             name = drive.trace.world
@@ -296,8 +299,8 @@ def _routes(experiment: Experiment) -> list[Block]:
             drawn = partial(routes.figure, world, [drive.trace], title, drive.events)
             kind = f"route-{label}-{run.info.seed}"
             blocks.append(_picture(experiment, kind, title, caption, drawn))
-    if not blocks and theirs:
-        return [Missing(f"route ({theirs})", "there is no route file")]
+    if theirs and not any(run.routes for run in experiment.runs):
+        return [*blocks, Missing(f"route ({theirs})", "there is no route file")]
     return blocks
 
 

@@ -61,7 +61,7 @@ def keep(folders: Sequence[Path], docs: Path) -> None:
 
 def _small_files(run: Run, target: Path, arrays: bool) -> Files:
     """Contents by new path; gzipped without time and name, so that equal tables stay equal."""
-    names = ["run.json", "evaluations.csv"]
+    names = ["run.json", "evaluations.csv", "tours.json"]
     if arrays:
         names += [path.name for path in sorted(run.folder.glob("*.npz"))]
     files = {

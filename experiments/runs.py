@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from experiments import routes
 from experiments.records import EPISODE_COLUMNS, EVALUATION_COLUMNS, by_world, read_csv
@@ -91,6 +91,23 @@ class RunInfo(_Record):
     """The thesis's numbers for this experiment, by the names of `measures.MEASURED`, or as text."""
 
 
+class TourInfo(_Record):
+    """One test drive with turns on the spot (A45), as `tours.json` tells it."""
+
+    passed: bool
+    """Full, past the box, and without a bump."""
+    driven: int = Field(ge=0)
+    """Actions, turns on the spot not counted."""
+    turned: int = Field(ge=0)
+    bumps: int = Field(ge=0)
+    route_share: float = Field(ge=0.0, le=1.0)
+    bridges: tuple[str, ...]
+    box_dropped: bool
+
+
+_TOURS = TypeAdapter(tuple[TourInfo, ...])
+
+
 @dataclass(frozen=True)
 class Rows:
     """A table read from CSV."""
@@ -138,6 +155,8 @@ class Run:
     probes: tuple[Probes, ...]
     routes: dict[str, Route]
     """By label."""
+    tours: tuple[TourInfo, ...]
+    """In the order of the starts; empty where the plan has none."""
 
     @property
     def window(self) -> int:
@@ -278,6 +297,7 @@ def read_run(folder: Path) -> Run:
             path.stem.removeprefix("route-"): routes.read(path)
             for path in sorted(folder.glob("route-*.npz"))
         },
+        _tours(folder / "tours.json"),
     )
 
 
@@ -285,6 +305,15 @@ def read_info(path: Path) -> RunInfo:
     """Read and check `run.json`. Raises StateError."""
     try:
         return RunInfo.model_validate_json(path.read_bytes())
+    except (OSError, ValidationError) as error:
+        raise StateError(f"{path}: {_first_line(error)}") from error
+
+
+def _tours(path: Path) -> tuple[TourInfo, ...]:
+    if not path.exists():
+        return ()
+    try:
+        return _TOURS.validate_json(path.read_bytes())
     except (OSError, ValidationError) as error:
         raise StateError(f"{path}: {_first_line(error)}") from error
 

@@ -1,9 +1,13 @@
-"""Tables of a report: every seed beside the floor and the ceiling."""
+"""Tables of a report: every seed beside the floor and the ceiling, and every test drive."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+
 from experiments.document import Table
-from experiments.measures import evaluated, number
+from experiments.measures import evaluated, number, of_seeds, spread
 from experiments.runs import Experiment, Run
 
 FIGURES = {
@@ -45,3 +49,59 @@ def _first_lap(run: Run, timed: bool) -> tuple[str, ...]:
 
 def _figures(run: Run, world: str, driver: str) -> tuple[str, ...]:
     return tuple(number(evaluated(column, world, driver)(run)) for column in FIGURES)
+
+
+def search(experiments: Sequence[Experiment]) -> Table:
+    """Variants of the demo: how soon each seed drove a lap frozen, and how well all drove then."""
+    header = (
+        "variant", "plan", "seeds", "drove a lap", "first lap after actions", "after s",
+        "bumps per 1,000", "distance", "s in all",
+    )  # fmt: skip
+    return Table("Variants of the demo (seeds of the search)", header,
+                 tuple(_variant(experiment) for experiment in experiments))  # fmt: skip
+
+
+def _variant(experiment: Experiment) -> tuple[str, ...]:
+    laps = [run.info.first_lap for run in experiment.runs if run.info.first_lap]
+    soonest = (spread(np.array([lap[name] for lap in laps])) for name in ("actions", "seconds"))
+    figures = (
+        spread(of_seeds(experiment, evaluated(name, "plus")))
+        for name in ("bumps_per_1000", "distance")
+    )
+    return (
+        experiment.first.title,
+        f"`{experiment.name}`",
+        ", ".join(str(run.info.seed) for run in experiment.runs),
+        f"{len(laps)} of {len(experiment.runs)}",
+        *soonest,
+        *figures,
+        spread(np.array([run.info.seconds for run in experiment.runs])),
+    )
+
+
+def tours(experiment: Experiment) -> Table:
+    """Every test drive of every seed (A45)."""
+    header = (
+        "seed", "drive", "full and without a bump", "actions driven", "turns on the spot", "bumps",
+        "of the route", "bridges", "past the box",
+    )  # fmt: skip
+    rows = tuple(
+        (
+            str(run.info.seed),
+            f"tour-{place}",
+            _yes(tour.passed),
+            f"{tour.driven:,}",
+            f"{tour.turned:,}",
+            str(tour.bumps),
+            f"{100 * tour.route_share:.0f} %",
+            ", ".join(tour.bridges) or "-",
+            _yes(tour.box_dropped),
+        )
+        for run in experiment.runs
+        for place, tour in enumerate(run.tours)
+    )
+    return Table("Test drives with turns on the spot (A45)", header, rows)
+
+
+def _yes(holds: bool) -> str:
+    return "yes" if holds else "no"

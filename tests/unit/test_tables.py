@@ -1,14 +1,27 @@
-"""The table of frozen drives: a row a seed, then floor and ceiling, and when a lap came first."""
+"""Tables: frozen drives with floor and ceiling, variants of the demo, test drives."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
 
+import pytest
+
+from experiments import findings
+from experiments.comparisons import compare_all
+from experiments.document import Table
 from experiments.records import EVALUATION_COLUMNS, read_csv, write_csv
+from experiments.report import section_of
 from experiments.runs import load
-from experiments.tables import frozen
+from experiments.tables import frozen, tours
+from shared.errors import StateError
 from tests.synthetic_runs import write_run
+
+LAP = {"seconds": 61.5, "actions": 8123, "episode": 40, "train_steps": 94}
+TOUR = {
+    "passed": True, "driven": 412, "turned": 60, "bumps": 0, "route_share": 0.62,
+    "bridges": ["east-bridge", "west-bridge"], "box_dropped": True,
+}  # fmt: skip
 
 
 def test_every_seed_and_both_references_have_a_row(tmp_path: Path) -> None:
@@ -50,3 +63,39 @@ def test_where_no_lap_was_looked_for_there_is_no_column(tmp_path: Path) -> None:
     (folder / "run.json").write_text(json.dumps(told))
     (experiment,) = load([tmp_path])
     assert "first lap after s" not in frozen(experiment, "plus").header
+
+
+def test_variants_of_the_demo_stand_side_by_side(tmp_path: Path) -> None:
+    for name, laps in (("search-fast", ({}, {})), ("search-demo", (LAP, {}))):
+        for seed, lap in zip((101, 102), laps, strict=True):
+            write_run(tmp_path, name, seed, first_lap=lap, seconds=100.0 * seed)
+    (section,) = compare_all(load([tmp_path]))
+    table = next(block for block in section.blocks if isinstance(block, Table))
+    assert table.title.startswith("Variants of the demo")
+    first, second = (dict(zip(table.header, row, strict=True)) for row in table.rows)
+    assert first["plan"] == "`search-demo`"
+    assert (first["drove a lap"], first["first lap after actions"]) == ("1 of 2", "8,123")
+    assert (first["seeds"], first["s in all"]) == ("101, 102", "10,150 (10,100 to 10,200)")
+    assert (second["drove a lap"], second["after s"]) == ("0 of 2", "-")
+
+
+def test_every_test_drive_has_a_row_and_a_damaged_file_is_named(tmp_path: Path) -> None:
+    folder = write_run(tmp_path, "i16c-test", 1)
+    path = folder / "tours.json"
+    drives = [TOUR, {**TOUR, "passed": False, "route_share": 0.3, "bridges": []},
+              {**TOUR, "passed": False, "bumps": 2, "box_dropped": False}]  # fmt: skip
+    path.write_text(json.dumps(drives))
+    (experiment,) = load([tmp_path])
+    table = tours(experiment)
+    assert [row[1:3] + row[5:] for row in table.rows] == [
+        ("tour-0", "yes", "0", "62 %", "east-bridge, west-bridge", "yes"),
+        ("tour-1", "no", "0", "30 %", "-", "yes"),
+        ("tour-2", "no", "2", "62 %", "east-bridge, west-bridge", "no"),
+    ]
+    (told,) = findings.tours(experiment)
+    assert "1 of 3 test drives were full and without a bump, 1 had no bump but" in told
+    section = section_of(experiment)
+    assert any(block == table for block in section.blocks)
+    path.write_text('[{"passed": 1}]')
+    with pytest.raises(StateError, match=r"tours\.json"):
+        load([tmp_path])
