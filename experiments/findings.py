@@ -243,8 +243,8 @@ def tours(experiment: Experiment) -> list[str]:
         clean = sum(not tour.bumps for tour in run.tours) - passed
         sentence = f"Seed {run.info.seed}: {passed} of {len(run.tours)} test drives were full and "
         sentence += "without a bump"
-        sentence += f", {clean} had no bump but were not full" if clean else ""
-        told.append(f"{sentence}; the one that the thesis tells of was.")
+        sentence += f", {clean} more without a bump but not full" if clean else ""
+        told.append(f"{sentence}; the only one that the thesis tells of was both.")
     return told
 
 

@@ -46,7 +46,8 @@ def test_gradient_steps_agree_with_the_runs_that_are_kept() -> None:
         told = costs.gradient_steps(load_plan(experiment.name, experiment.scale))
         for run in experiment.runs:
             if run.info.complete:
-                assert run.train_steps == pytest.approx(told, rel=0.1), run.folder
+                # RMM may leave the memory less full than it could be
+                assert 0.75 * told <= run.train_steps <= told, run.folder
 
 
 def full_runs(out: Path) -> list[Experiment]:

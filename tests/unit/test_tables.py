@@ -93,7 +93,7 @@ def test_every_test_drive_has_a_row_and_a_damaged_file_is_named(tmp_path: Path) 
         ("tour-2", "no", "2", "62 %", "east-bridge, west-bridge", "no"),
     ]
     (told,) = findings.tours(experiment)
-    assert "1 of 3 test drives were full and without a bump, 1 had no bump but" in told
+    assert "1 of 3 test drives were full and without a bump, 1 more without a bump but" in told
     section = section_of(experiment)
     assert any(block == table for block in section.blocks)
     path.write_text('[{"passed": 1}]')
