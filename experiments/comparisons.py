@@ -8,6 +8,7 @@ from functools import partial
 from experiments import findings, tables
 from experiments.document import Block, Findings, Missing, Picture, Section, Table
 from experiments.figures import evaluation, probes, progress
+from experiments.figures.style import told_apart
 from experiments.measures import (
     MISSING,
     Kept,
@@ -188,13 +189,18 @@ def _rank(item: tuple[str, Experiment]) -> tuple[int, str]:
 def _together(group: str, shown: Sequence[Experiment]) -> list[Block]:
     scale = shown[0].scale
     blocks: list[Block] = []
+    names = [experiment.name for experiment in shown]
     for world in sorted(set.intersection(*(set(e.worlds) for e in shown))):
+        if not told_apart(names):
+            what = f"frozen evaluation in {world}, {len(names)} experiments"
+            blocks.append(Missing(what, "more than colours tell apart; each has its own figure"))
+            continue
         caption = (
             "Greedy drives without learning; bands: lowest to highest seed; thin lines: single "
             "seeds."
         )
         drawn = partial(evaluation.curves, shown, world)
-        title = f"Frozen evaluation in {world}, {', '.join(e.name for e in shown)}"
+        title = f"Frozen evaluation in {world}, {', '.join(names)}"
         name = f"{scale}-evaluation-{group}-in-{world}"
         blocks.append(Picture(name, title, caption, drawn))
     one_with_others = group.startswith(("search", "parts"))

@@ -80,9 +80,14 @@ def png(figure: Figure) -> bytes:
 
 
 def colours(names: Iterable[str]) -> dict[str, str]:
-    """One colour per experiment, the same in every figure of a page."""
+    """One colour per experiment; they repeat where `told_apart` says no."""
     rest = sorted(set(names) - set(EXPERIMENTS))
     return EXPERIMENTS | {name: OTHERS[i % len(OTHERS)] for i, name in enumerate(rest)}
+
+
+def told_apart(names: Iterable[str]) -> bool:
+    """Whether there are colours enough for these experiments in one figure."""
+    return len(set(names) - set(EXPERIMENTS)) <= len(OTHERS)
 
 
 def world_colour(name: str) -> str:

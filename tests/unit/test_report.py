@@ -188,6 +188,19 @@ def test_one_experiment_is_not_compared(tmp_path: Path) -> None:
     assert compare_all([experiment(tmp_path, "i16c")]) == []
 
 
+def test_more_experiments_than_colours_share_no_figure(tmp_path: Path) -> None:
+    for count in (6, 7):
+        folder = tmp_path / str(count)
+        for variant in range(count):
+            for seed in (1, 2):
+                write_run(folder, f"search-{variant}", seed)
+        (section,) = compare_all(load([folder]))
+        shared = [title for title in titles(section) if title.startswith("Frozen evaluation")]
+        left_out = [what for what in missing(section) if what.startswith("frozen evaluation")]
+        assert (len(shared), len(left_out)) == ((1, 0) if count == 6 else (0, 1))
+        assert "Differences between experiments" in titles(section)
+
+
 def test_variants_are_compared_with_what_they_vary(tmp_path: Path) -> None:
     names = ("search-fast", "search-demo", "search-normm", "plus-rmm-quotas", "plus-rmm-nopretrain")
     (section,) = compare_all([experiment(tmp_path, name, (1, 2)) for name in names])
