@@ -215,7 +215,10 @@ def _together(group: str, shown: Sequence[Experiment]) -> list[Block]:
         blocks.append(Picture(name, "Differences between experiments", caption, drawn))
         told = [*(findings.difference(pair) for pair in pairs), *findings.same_start(shown)]
         blocks.append(Findings(tuple(told)))
-    return [*blocks, *(Missing("difference of bumps", line) for line in refused)]
+    if refused:
+        why = f"{'; '.join(refused)}, at least 2 each needed"
+        blocks.append(Missing("difference of bumps", why))
+    return blocks
 
 
 def _equal(named: Named) -> list[Block]:

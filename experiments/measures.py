@@ -111,7 +111,7 @@ def compare(
         first_only: Only pairs with the first of them, in place of all.
 
     Returns:
-        The differences, and one line for every pair with too few seeds to compare.
+        The differences, and a few words for every pair with fewer than 2 seeds of either.
     """
     pairs, refused = [], []
     for i, ours in enumerate(experiments[:1] if first_only else experiments):
@@ -122,7 +122,7 @@ def compare(
                 draw = generator(BOOTSTRAP_SEED, "bootstrap", ours.name, theirs.name, world)
                 if min(len(a), len(b)) < 2:
                     names = f"{ours.name} and {theirs.name} in {world}"
-                    refused.append(f"{names}: {len(a)} and {len(b)} seeds, at least 2 each needed")
+                    refused.append(f"{names}: {len(a)} and {len(b)} seeds")
                     continue
                 difference = bootstrap_difference(a, b, draw)
                 pairs.append(Compared(ours.name, theirs.name, world, (len(a), len(b)), difference))
