@@ -190,11 +190,12 @@ def _together(group: str, shown: Sequence[Experiment]) -> list[Block]:
     scale = shown[0].scale
     blocks: list[Block] = []
     names = [experiment.name for experiment in shown]
-    for world in sorted(set.intersection(*(set(e.worlds) for e in shown))):
-        if not told_apart(names):
-            what = f"frozen evaluation in {world}, {len(names)} experiments"
-            blocks.append(Missing(what, "more than colours tell apart; each has its own figure"))
-            continue
+    worlds = sorted(set.intersection(*(set(e.worlds) for e in shown)))
+    if not told_apart(names):
+        what = f"frozen evaluation of {len(names)} experiments together"
+        blocks.append(Missing(what, "more than colours tell apart; each has its own figure"))
+        worlds = []
+    for world in worlds:
         caption = (
             "Greedy drives without learning; bands: lowest to highest seed; thin lines: single "
             "seeds."

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from experiments.comparisons import SEARCH
 from experiments.document import Block, Missing, Table
 from experiments.measures import of_seeds
 from experiments.plan import Plan, load_plan, plan_names, stage_config
 from experiments.runs import Experiment, Run
 
 TITLE = "Cost of the full scale, a seed each"
-VARIANTS = "search-"
-"""Plans that have no full scale of their own: variants of the demo."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,8 @@ def rates(runs: Sequence[Run]) -> Rates | None:
 
     Least squares of the relative errors. None where the runs cannot tell the two apart.
     """
-    done = [run for run in runs if run.info.complete and run.info.seconds > 0.0]
+    trained = [run for run in runs if run.info.complete and len(run.episodes)]
+    done = [run for run in trained if run.info.seconds > 0.0]
     counts = np.array([(run.actions, run.train_steps) for run in done], np.float64).reshape(-1, 2)
     seconds = np.array([run.info.seconds for run in done], np.float64)
     found, _, rank, _ = np.linalg.lstsq(counts / seconds[:, None], np.ones(len(done)), rcond=None)
@@ -82,7 +82,7 @@ def full_scale(experiments: Sequence[Experiment], gpu_step_ms: float | None = No
     rows = []
     for name in plan_names():
         plan = load_plan(name, "full")
-        if name.startswith(VARIANTS) or not plan.stages:
+        if name.startswith(SEARCH) or not plan.stages:
             continue
         ours = named.get(("full", name))
         actions, source = _actions(plan, ours, named.get(("mini", name)))

@@ -137,7 +137,8 @@ def memory(experiment: Experiment) -> list[str]:
         return []
     middles = [float(np.median(values)) for values in shares.values()]
     together = np.stack(list(shares.values()))
-    balanced = float(np.median(np.ptp(together, axis=0))) <= BALANCED
+    spans = np.ptp(together, axis=0)
+    balanced = float(np.median(spans)) <= BALANCED
     told = ", ".join(
         f"{name} {100 * middle:.1f} %" for name, middle in zip(ACTIONS, middles, strict=True)
     )
@@ -145,7 +146,10 @@ def memory(experiment: Experiment) -> list[str]:
     expected = EXPECTED_BALANCED.get(experiment.name)
     end = "" if expected is None else f", {_verdict(expected == balanced)}"
     when = "At the end" if all(run.info.complete for run in experiment.runs) else "So far"
-    return [f"{when} the memory held {told} (medians of the seeds): {word}{end}."]
+    seeds = f"{np.count_nonzero(spans <= BALANCED)} of {len(spans)} seeds"
+    return [
+        f"{when} the memory held {told} (medians of the seeds): {word}{end}; balanced in {seeds}."
+    ]
 
 
 def _share(action: str, run: Run) -> float:

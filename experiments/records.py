@@ -22,6 +22,8 @@ import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from pydantic import BaseModel, ConfigDict, Field
+
 Value = int | float | str
 Row = Mapping[str, Value]
 
@@ -82,6 +84,22 @@ EVALUATION_COLUMNS = (
 )
 WALL_TIME = "seconds"
 """The one column that two runs of the same seed may differ in."""
+
+
+class TourRecord(BaseModel):
+    """One test drive with turns on the spot (A45): an entry of `tours.json`."""
+
+    model_config = ConfigDict(frozen=True)
+
+    passed: bool
+    """Full, past the box, and without a bump."""
+    driven: int = Field(ge=0)
+    """Actions, turns on the spot not counted."""
+    turned: int = Field(ge=0)
+    bumps: int = Field(ge=0)
+    route_share: float = Field(ge=0.0, le=1.0)
+    bridges: tuple[str, ...]
+    box_dropped: bool
 
 
 def write_csv(path: Path, columns: tuple[str, ...], rows: Iterable[Row]) -> None:

@@ -104,7 +104,9 @@ def overview_blocks(
         tuple(_origin_row(run) for run in every),
     )
     full = costs.full_scale(experiments, gpu_step_ms)
-    return (numbers, _costs(experiments, gpu_step_ms), full, origins)
+    drives = tables.test_drives(experiments)
+    shown = (drives,) if drives.rows else ()
+    return (numbers, _costs(experiments, gpu_step_ms), full, *shown, origins)
 
 
 def _number_rows(run: Run) -> list[tuple[str, ...]]:
@@ -155,6 +157,7 @@ def section_of(experiment: Experiment) -> Section:
     blocks += _memory(experiment)
     blocks += _evaluations(experiment)
     blocks += _probes(experiment)
+    blocks += _tours(experiment)
     blocks += _routes(experiment)
     title = f"{experiment.first.title} ({experiment.full_name})"
     return Section(experiment.full_name, title, tuple(blocks))
@@ -282,11 +285,14 @@ def _predictions(experiment: Experiment, kind: str, choice: probes.Choice) -> Pi
     return _picture(experiment, kind, title, caption, drawn)
 
 
+def _tours(experiment: Experiment) -> list[Block]:
+    told = findings.tours(experiment)
+    return [tables.tours(experiment), Findings(tuple(told))] if told else []
+
+
 def _routes(experiment: Experiment) -> list[Block]:
     theirs = THESIS_FIGURES.get((experiment.name, "route"))
     blocks: list[Block] = []
-    if told := findings.tours(experiment):
-        blocks += [tables.tours(experiment), Findings(tuple(told))]
     for run in experiment.runs:
         for label, drive in run.routes.items():
             name = drive.trace.world
@@ -299,8 +305,8 @@ def _routes(experiment: Experiment) -> list[Block]:
             drawn = partial(routes.figure, world, [drive.trace], title, drive.events)
             kind = f"route-{label}-{run.info.seed}"
             blocks.append(_picture(experiment, kind, title, caption, drawn))
-    if theirs and not any(run.routes for run in experiment.runs):
-        return [*blocks, Missing(f"route ({theirs})", "there is no route file")]
+    if not blocks and theirs:
+        return [Missing(f"route ({theirs})", "there is no route file")]
     return blocks
 
 

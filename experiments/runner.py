@@ -276,7 +276,7 @@ class Run:
         tours = self._observer.tours(world, self.plan.tours, self.plan.tour_policy)
         for number, tour in enumerate(tours):
             routes.write(self.folder / f"route-tour-{number}.npz", tour.route)
-            told.append(tour.told)
+            told.append(tour.told.model_dump(mode="json"))
         write_atomically(self.folder / "tours.json", (json.dumps(told, indent=2) + "\n").encode())
 
     def _refer(self) -> None:

@@ -18,7 +18,13 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from experiments import routes
-from experiments.records import EPISODE_COLUMNS, EVALUATION_COLUMNS, by_world, read_csv
+from experiments.records import (
+    EPISODE_COLUMNS,
+    EVALUATION_COLUMNS,
+    TourRecord,
+    by_world,
+    read_csv,
+)
 from experiments.routes import Route
 from shared.errors import ConfigError, StateError
 
@@ -91,21 +97,7 @@ class RunInfo(_Record):
     """The thesis's numbers for this experiment, by the names of `measures.MEASURED`, or as text."""
 
 
-class TourInfo(_Record):
-    """One test drive with turns on the spot (A45), as `tours.json` tells it."""
-
-    passed: bool
-    """Full, past the box, and without a bump."""
-    driven: int = Field(ge=0)
-    """Actions, turns on the spot not counted."""
-    turned: int = Field(ge=0)
-    bumps: int = Field(ge=0)
-    route_share: float = Field(ge=0.0, le=1.0)
-    bridges: tuple[str, ...]
-    box_dropped: bool
-
-
-_TOURS = TypeAdapter(tuple[TourInfo, ...])
+_TOURS = TypeAdapter(tuple[TourRecord, ...])
 
 
 @dataclass(frozen=True)
@@ -155,7 +147,7 @@ class Run:
     probes: tuple[Probes, ...]
     routes: dict[str, Route]
     """By label."""
-    tours: tuple[TourInfo, ...]
+    tours: tuple[TourRecord, ...]
     """In the order of the starts; empty where the plan has none."""
 
     @property
@@ -309,7 +301,7 @@ def read_info(path: Path) -> RunInfo:
         raise StateError(f"{path}: {_first_line(error)}") from error
 
 
-def _tours(path: Path) -> tuple[TourInfo, ...]:
+def _tours(path: Path) -> tuple[TourRecord, ...]:
     if not path.exists():
         return ()
     try:

@@ -79,6 +79,27 @@ def _variant(experiment: Experiment) -> tuple[str, ...]:
     )
 
 
+def test_drives(experiments: Sequence[Experiment]) -> Table:
+    """How the test drives of every run went, a row a run (A45)."""
+    header = (
+        "experiment", "scale", "seed", "full and without a bump", "without a bump", "bumps of each",
+    )  # fmt: skip
+    rows = tuple(
+        (
+            run.info.experiment,
+            run.info.scale,
+            str(run.info.seed),
+            f"{sum(tour.passed for tour in run.tours)} of {len(run.tours)}",
+            f"{sum(not tour.bumps for tour in run.tours)} of {len(run.tours)}",
+            ", ".join(str(tour.bumps) for tour in run.tours),
+        )
+        for experiment in experiments
+        for run in experiment.runs
+        if run.tours
+    )
+    return Table("Test drives (A45)", header, rows)
+
+
 def tours(experiment: Experiment) -> Table:
     """Every test drive of every seed (A45)."""
     header = (

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from experiments.choosers import GREEDY, Predicts
 from experiments.environment import CorridorEnv
+from experiments.records import TourRecord
 from experiments.routes import Event, Route
 from experiments.traces import Trace
 from services.robot_driver.robot import Pose
@@ -61,17 +61,17 @@ class Tour:
         return int(self.route.trace.bumps.sum())
 
     @property
-    def told(self) -> dict[str, Any]:
+    def told(self) -> TourRecord:
         """The figures, for a file."""
-        return {
-            "passed": self.passed,
-            "driven": self.driven,
-            "turned": self.turned,
-            "bumps": self.bumps,
-            "route_share": round(self.route_share, 4),
-            "bridges": list(self.bridges),
-            "box_dropped": self.box_dropped,
-        }
+        return TourRecord(
+            passed=self.passed,
+            driven=self.driven,
+            turned=self.turned,
+            bumps=self.bumps,
+            route_share=round(self.route_share, 4),
+            bridges=self.bridges,
+            box_dropped=self.box_dropped,
+        )
 
     @property
     def passed(self) -> bool:

@@ -196,7 +196,7 @@ def test_more_experiments_than_colours_share_no_figure(tmp_path: Path) -> None:
                 write_run(folder, f"search-{variant}", seed)
         (section,) = compare_all(load([folder]))
         shared = [title for title in titles(section) if title.startswith("Frozen evaluation")]
-        left_out = [what for what in missing(section) if what.startswith("frozen evaluation")]
+        left_out = [what for what in missing(section) if what.startswith("frozen evaluation of")]
         assert (len(shared), len(left_out)) == ((1, 0) if count == 6 else (0, 1))
         assert "Differences between experiments" in titles(section)
 

@@ -57,6 +57,15 @@ def test_predictions_are_kept_of_the_lowest_seed_only(docs: Path) -> None:
     ]  # fmt: skip
 
 
+def test_test_drives_are_kept_of_every_seed(tmp_path: Path) -> None:
+    for seed in (1, 2):
+        folder = write_run(tmp_path / "runs", "i16c-test", seed)
+        (folder / "tours.json").write_text("[]")
+    results.keep([tmp_path / "runs"], tmp_path / "docs")
+    kept = tmp_path / "docs" / "results" / "i16c-test-mini"
+    assert [(kept / f"seed-{seed}" / "tours.json").read_text() for seed in (1, 2)] == ["[]", "[]"]
+
+
 def test_the_page_lists_every_run_and_shows_every_picture(docs: Path) -> None:
     page = (docs / "results.md").read_text()
     rows = [line for line in page.splitlines() if line.startswith("| policy-")]

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from experiments import findings
+from experiments import findings, tables
 from experiments.comparisons import compare_all
 from experiments.document import Table
 from experiments.records import EVALUATION_COLUMNS, read_csv, write_csv
-from experiments.report import section_of
+from experiments.report import overview_blocks, section_of
 from experiments.runs import load
 from experiments.tables import frozen, tours
 from shared.errors import StateError
@@ -94,6 +94,9 @@ def test_every_test_drive_has_a_row_and_a_damaged_file_is_named(tmp_path: Path) 
     ]
     (told,) = findings.tours(experiment)
     assert "1 of 3 test drives were full and without a bump, 1 more without a bump but" in told
+    (counted,) = tables.test_drives([experiment]).rows
+    assert counted == ("i16c-test", "mini", "1", "1 of 3", "2 of 3", "0, 0, 2")
+    assert any(getattr(block, "rows", ()) == (counted,) for block in overview_blocks([experiment]))
     section = section_of(experiment)
     assert any(block == table for block in section.blocks)
     path.write_text('[{"passed": 1}]')
