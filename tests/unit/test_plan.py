@@ -26,8 +26,6 @@ mini_batches_per_episode = 2
 [mini]
 factor = 10
 mini_batches = 3
-[mini.config.network]
-filters = 16
 """
 THESIS = {
     # stage by stage: episodes, memory, strategy, mini-batches, fit every, highest threshold, world
@@ -132,6 +130,19 @@ def test_every_plan_can_be_run_after_its_predecessor(scale: str) -> None:
             before = load_plan(plan.after, scale)  # type: ignore[arg-type]
             assert stage_config(before, 0, 1).network == stage_config(plan, 0, 1).network
             assert plan.seeds == before.seeds
+
+
+def test_every_mini_plan_has_the_narrow_network_unless_it_says_otherwise() -> None:
+    config = stage_config(read_plan("small", SMALL, "mini"), 0, 1)
+    assert (config.network.filters, config.network.layout) == (16, "cpcccp")
+    assert (config.numerics.learner.batch, config.numerics.replay.engine) == (16, "auto")
+    own = SMALL + "[mini.config.network]\nfilters = 8\n[mini.config.numerics.learner]\nbatch = 4\n"
+    config = stage_config(read_plan("small", own, "mini"), 1, 1)
+    assert (config.network.filters, config.network.layout) == (8, "cpcccp")
+    assert config.numerics.learner.batch == 4
+    full = stage_config(read_plan("small", own, "full"), 0, 1)
+    assert full.network.filters == 64
+    assert full.numerics.learner.batch == 8
 
 
 def test_mini_divides_sizes_and_periods_and_nothing_else() -> None:
