@@ -28,6 +28,7 @@ from shared.errors import CorridorError
 OUT = Path("runs") / "experiments"
 """Default folder of all experiments."""
 POLL_S = 0.5
+STOPS = (signal.SIGINT, signal.SIGTERM)
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def run_experiment(
         scale: `full` or `mini`.
         seeds: These, or how many of each plan's own, from the first.
         out: Folder for all runs.
-        jobs: Runs side by side; each computes with the threads its plan gives it.
+        jobs: Runs side by side; they divide the cores among them.
         console: Where progress is shown.
 
     Raises:
@@ -87,8 +88,13 @@ def run_experiment(
     context = multiprocessing.get_context("spawn")
     reports: Any = context.Queue()
     stop: Any = context.Event()
+    shares: Any = context.Queue()
+    for share in shares_of(sorted(os.sched_getaffinity(0)), jobs):
+        shares.put(share)
+    for number in STOPS:  # also where the shell had SIGINT ignored, as it does in the background
+        signal.signal(number, signal.default_int_handler)
     with (
-        ProcessPoolExecutor(jobs, context, _begin, (reports, stop)) as pool,
+        ProcessPoolExecutor(jobs, context, _begin, (reports, stop, shares)) as pool,
         _bars(console) as bars,
     ):
         # A chain of one seed is one piece of work; equal jobs of two chains are done only once.
@@ -99,6 +105,11 @@ def run_experiment(
             console.print("stopping after the current turns; the same command goes on")
             stop.set()
         return _results(futures, stop)
+
+
+def shares_of(cores: Sequence[int], jobs: int) -> list[set[int]]:
+    """Cores of each of the runs side by side: different ones as far as there are enough."""
+    return [set(cores[job % len(cores) :: jobs]) for job in range(jobs)]
 
 
 def _distinct(chains: list[list[Job]]) -> list[list[Job]]:
@@ -162,10 +173,16 @@ _reports: Any = None
 _stop: Any = None
 
 
-def _begin(reports: Any, stop: Any) -> None:
-    """Prepare a worker: Ctrl-C is the main process's business."""
+def _begin(reports: Any, stop: Any, shares: Any) -> None:
+    """Prepare a worker: stopping is the main process's business, and the cores are divided.
+
+    A plan may leave the number of threads to the cores there are: on the same ones, runs would slow
+    each other down.
+    """
     global _reports, _stop
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in STOPS:
+        signal.signal(number, signal.SIG_IGN)
+    os.sched_setaffinity(0, shares.get())
     _reports, _stop = reports, stop
     _end_with_parent()
 

@@ -2,8 +2,9 @@
 
 A plan is a TOML file in `plans/`: a configuration (differences to the defaults only), stages that
 change parts of it while the run goes on, and the plan whose end it begins with. `full` has the
-exact constants; `mini` has the same shape, with episodes and memories divided by the plan's factors
-(the counts of the memory follow, E17b), a narrower network, and arithmetic that suits it.
+exact constants, computed on a GPU where there is one; `mini` has the same shape, with episodes and
+memories divided by the plan's factors (the counts of the memory follow, E17b), a narrower network,
+and arithmetic that suits it.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ SIZES = (("memory", "capacity"), ("memory", "capacity_max"), ("memory", "capacit
 """What a smaller scale divides by its `memory_factor`."""
 PERIODS = (("memory", "equalise_every"), ("learning", "fit_every"))
 """What it divides by its `factor`: periods counted in episodes."""
+FULL: Tree = {"numerics": preset_tree("demo")["numerics"]}
+"""What every plan has at full scale: the demo's way to compute, measured where it runs."""
 MINI: Tree = {
     "network": {"filters": 16, "layout": "cpcccp"},
     "numerics": {
@@ -150,7 +153,10 @@ def read_plan(name: str, text: str, scale: Scale) -> Plan:
         raise ConfigError(_one_line(f"plan {name}", error)) from error
     if plan.preset:
         plan = plan.model_copy(update={"config": merged(preset_tree(plan.preset), plan.config)})
-    plan = scaled(plan) if scale == "mini" else plan
+    if scale == "mini":
+        plan = scaled(plan)
+    else:
+        plan = plan.model_copy(update={"config": merged(FULL, plan.config)})
     for index in range(max(1, len(plan.stages))):
         stage_config(plan, index, seed=1)
     return plan

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import platform
 import shutil
 import subprocess
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
+
+if TYPE_CHECKING:
+    from shared.config import Config
 
 ROOT = Path(__file__).parents[1]
 RECORDED = (":!docs", ":!benchmarks/results.json", ":!benchmarks/results.md")
@@ -24,6 +30,17 @@ def machine() -> dict[str, str]:
         "torch": torch.__version__,
         "commit": commit(),
     }
+
+
+def machine_key(config: Config) -> str:
+    """8 hex digits over what decides which arithmetic is the fastest one."""
+    decides = {
+        "machine": [_processor(), len(os.sched_getaffinity(0)), torch.__version__],
+        "network": config.network.model_dump(mode="json"),
+        "numerics": config.numerics.model_dump(mode="json"),
+        "learning": [config.learning.batch_size, config.learning.mode],
+    }
+    return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:8]
 
 
 def commit() -> str:

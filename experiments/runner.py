@@ -12,14 +12,14 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from experiments import probes, records, routes, snapshot
 from experiments.observer import Observer
 from experiments.plan import Plan, Scale, Stage, stage_config
-from experiments.provenance import machine
+from experiments.provenance import machine, machine_key
 from experiments.recorder import episode_row, memory_hash
 from experiments.references import DRIVERS
 from experiments.single_process import SingleProcess, TurnDone
@@ -29,7 +29,7 @@ from services.robot_driver.world import load_world
 from shared.config import Config
 from shared.errors import ConfigError, StateError
 from shared.messages import WorldChange
-from shared.numerics import settle
+from shared.numerics import Role, settle
 from shared.rl.network import to_bytes
 from shared.settings import claim
 from shared.statefile import write_atomically
@@ -98,7 +98,8 @@ class Run:
         self._scale: Scale = scale
         self._command, self._started = command, time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
         first = claim(folder, stage_config(plan, 0, seed))
-        roles = {role: settle(first, folder, role) for role in ("actor", "replay", "learner")}
+        common = folder.parents[1] / "machines" / machine_key(first)
+        roles = {role: settle(first, folder, role, common) for role in get_args(Role)}
         self._numerics = first.numerics.model_copy(update=roles)
         self._loop = SingleProcess(self._config(0), self._robot(self._config(0).robot.world))
         self._totals = Totals()

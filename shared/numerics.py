@@ -31,8 +31,10 @@ WORTHWHILE = 0.8
 """What is not plain must take less than this part of the plain way's time to be chosen."""
 
 
-def settle(config: Config, folder: Path, role: Role) -> Numerics:
+def settle(config: Config, folder: Path, role: Role, common: Path | None = None) -> Numerics:
     """The settled numerics of one role in this run folder; chooses and stores them at first use.
+
+    common: a folder where runs that are to compute alike share what the first of them chose.
 
     Raises StateError when the stored ones are damaged, ConfigError when they name what is missing.
     """
@@ -47,7 +49,7 @@ def settle(config: Config, folder: Path, role: Role) -> Numerics:
             raise StateError(f"{path}: damaged: {error.errors()[0]['msg']}") from error
         except ValueError as error:
             raise StateError(f"{path}: damaged: {error}") from error
-    chosen = choose(config, wanted, role)
+    chosen = settle(config, common, role) if common else choose(config, wanted, role)
     write_atomically(path, (json.dumps(chosen.model_dump(), indent=1) + "\n").encode())
     return chosen
 

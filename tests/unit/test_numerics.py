@@ -34,6 +34,20 @@ def test_choice_is_made_once_and_read_back(tmp_path: Path, monkeypatch: pytest.M
     assert numerics.settle(OPEN, tmp_path, "actor") == first
 
 
+def test_runs_beside_each_other_compute_alike(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """L8: near a tie, two measurements choose differently."""
+    times = iter([[1.0, 0.79], [1.0, 0.81]])
+    monkeypatch.setattr(numerics, "_seconds", lambda *_: next(times))
+    common = tmp_path / "common"
+    first = numerics.settle(OPEN, tmp_path / "one", "actor", common)
+    assert first.precision == "bfloat16"
+    assert numerics.settle(OPEN, tmp_path / "two", "actor", common) == first
+    assert numerics.settle(OPEN, tmp_path / "two", "actor") == first  # its own from now on
+    assert numerics.settle(OPEN, tmp_path / "alone", "actor").precision == "float32"
+
+
 @pytest.mark.parametrize(("ratio", "precision"), [(0.79, "bfloat16"), (0.81, "float32")])
 def test_reduced_precision_must_be_worth_it(
     ratio: float, precision: str, monkeypatch: pytest.MonkeyPatch

@@ -142,7 +142,7 @@ def test_every_mini_plan_has_the_narrow_network_unless_it_says_otherwise() -> No
     assert config.numerics.learner.batch == 4
     full = stage_config(read_plan("small", own, "full"), 0, 1)
     assert full.network.filters == 64
-    assert full.numerics.learner.batch == 8
+    assert (full.numerics.learner.batch, full.numerics.learner.device) == (8, "auto")
 
 
 def test_mini_divides_sizes_and_periods_and_nothing_else() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from experiments import records
-from experiments.experiment import Job, _distinct, chain
+from experiments.experiment import Job, _distinct, chain, shares_of
 from experiments.plan import Plan, read_plan
 from experiments.runner import Progress, Run
 from shared.errors import ConfigError, StateError
@@ -27,6 +27,10 @@ strategy = "normm"
 batch_size = 16
 [config.robot]
 world = "{first}"
+[config.numerics] # measured ones may differ between folders that share nothing
+actor = {{ engine = "torch", precision = "float32" }}
+replay = {{ device = "cpu", engine = "torch", threads = 1, precision = "float32" }}
+learner = {{ device = "cpu", threads = 1, precision = "float32" }}
 [[stages]]
 name = "a"
 until = 3
@@ -235,3 +239,18 @@ def test_chains_begin_with_their_first_plan_and_share_runs() -> None:
     jobs = {name: Job(name, "mini", 1, Path()) for name in ("a", "b", "c", "d")}
     a, b, c, d = jobs.values()
     assert _distinct([[a, b], [a, c], [d]]) == [[a, b, c], [d]]
+
+
+@pytest.mark.parametrize(
+    ("cores", "jobs", "shares"),
+    [
+        ([0, 1], 1, [{0, 1}]),
+        ([0, 1], 2, [{0}, {1}]),
+        ([3, 5, 7], 2, [{3, 7}, {5}]),
+        ([4], 3, [{4}, {4}, {4}]),
+    ],
+)
+def test_runs_side_by_side_divide_the_cores(
+    cores: list[int], jobs: int, shares: list[set[int]]
+) -> None:
+    assert shares_of(cores, jobs) == shares
