@@ -84,7 +84,7 @@ def first_lap(experiment: Experiment) -> list[str]:
     if not driven:
         return []
     actions, seconds = (np.array([lap[name] for lap in driven]) for name in ("actions", "seconds"))
-    told = f"{len(driven)} of {len(laps)} seeds drove a first lap frozen, after {spread(actions)} "
+    told = f"{len(driven)} of {len(laps)} seeds drove a first lap frozen, after {spread(actions)}"
     return [f"{told} actions, {spread(seconds)} s of learning."]
 
 
