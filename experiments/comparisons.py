@@ -65,6 +65,7 @@ def compare_all(experiments: Sequence[Experiment]) -> list[Section]:
                 *_fitted(named),
                 *_searched(named),
                 *_frozen(named),
+                *_memories(named),
                 *_equal(named),
                 *_predictions(named, "plus-rmm", "plus-normm", "4.10", of_best=True),
                 *_predictions(named, "plus-minus", "plus-rmm", "4.16", of_best=False),
@@ -149,6 +150,12 @@ def _searched(named: Named) -> list[Block]:
     """The variants of the demo side by side, the demo itself first."""
     shown = [e for name, e in sorted(named.items(), key=_rank) if name.startswith(SEARCH)]
     return [tables.search(shown)] if len(shown) > 1 else []
+
+
+def _memories(named: Named) -> list[Block]:
+    """What the memories were made of, where runs told."""
+    table = tables.memories([experiment for _, experiment in sorted(named.items(), key=_rank)])
+    return [table] if len(table.rows) > 1 else []
 
 
 def _frozen(named: Named) -> list[Block]:

@@ -1,4 +1,4 @@
-"""The record of one episode, and what proves that compared runs began alike."""
+"""The record of one episode, of a memory, and what proves that compared runs began alike."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from experiments.records import Row
 from experiments.single_process import SingleProcess, TurnDone
+from shared.rl.memory import ReplayMemory
 from shared.rl.policy import FORWARD, FORWARD_LEFT, FORWARD_RIGHT
 
 
@@ -52,6 +53,19 @@ def episode_row(loop: SingleProcess, done: TurnDone, stage: str, seconds: float)
         "threshold_percent": discarded.threshold_percent,
         "seconds": round(seconds, 2),
     }
+
+
+def held(memory: ReplayMemory) -> dict[str, float] | None:
+    """What a memory is made of (`runs.MemoryInfo`); None if nothing is in it."""
+    if not len(memory):
+        return None
+    rewards = memory.rows["reward"]
+    figures = {
+        "of_fill": np.mean(memory.rows["episode"] == 0),
+        "negative": np.mean(rewards < 0.0),
+        "mean_reward": np.mean(rewards),
+    }
+    return {name: round(float(value), 4) for name, value in figures.items()}
 
 
 def memory_hash(loop: SingleProcess, before: int) -> str:

@@ -20,7 +20,7 @@ from experiments import probes, records, routes, snapshot
 from experiments.observer import Observer
 from experiments.plan import Plan, Scale, Stage, stage_config
 from experiments.provenance import machine, machine_key
-from experiments.recorder import episode_row, memory_hash
+from experiments.recorder import episode_row, held, memory_hash
 from experiments.references import DRIVERS
 from experiments.single_process import SingleProcess, TurnDone
 from experiments.traces import Figures
@@ -380,6 +380,7 @@ class Run:
             "longest_run": self._totals.longest_run,
             "prefill": self._totals.prefill,
             "first_lap": self._totals.first_lap,
+            "memory": held(self._loop.memory),
             "stages": self._totals.stages,
             "thesis": plan.thesis,
         }

@@ -79,6 +79,33 @@ def _variant(experiment: Experiment) -> tuple[str, ...]:
     )
 
 
+def memories(experiments: Sequence[Experiment]) -> Table:
+    """What memories held in the end, and how many actions were taken for each of their places."""
+    header = (
+        "experiment", "seeds", "actions for each place", "left of the filling, %",
+        "reward below 0, %", "mean reward",
+    )  # fmt: skip
+    rows = []
+    for experiment in experiments:
+        told = [
+            (run, run.info.memory)
+            for run in experiment.runs
+            if run.info.memory and len(run.episodes)
+        ]
+        if not told:
+            continue
+        turnover = [run.actions / run.episodes.numbers("capacity")[-1] for run, _ in told]
+        figures = (
+            turnover,
+            [100.0 * memory.of_fill for _, memory in told],
+            [100.0 * memory.negative for _, memory in told],
+            [memory.mean_reward for _, memory in told],
+        )
+        seeds = ", ".join(str(run.info.seed) for run, _ in told)
+        rows.append((experiment.name, seeds, *(spread(np.array(each)) for each in figures)))
+    return Table("What the memories held in the end", header, tuple(rows))
+
+
 def test_drives(experiments: Sequence[Experiment]) -> Table:
     """How the test drives of every run went, a row a run (A45)."""
     header = (

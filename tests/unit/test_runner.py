@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from experiments import records
@@ -172,6 +173,13 @@ def test_the_record_of_a_run_says_how_to_repeat_it(finished: Path) -> None:
     assert record["complete"] is True
     assert [stage["name"] for stage in record["stages"]] == ["a", "b"]
     assert [stage["last_episode"] for stage in record["stages"]] == [10, 14]
+    with np.load(finished / "two" / "state-end" / "memory.npz") as file:
+        stored = file["rows"]
+    assert record["memory"] == {
+        "of_fill": pytest.approx(sum(stored["episode"] == 0) / len(stored), abs=1e-4),
+        "negative": pytest.approx(sum(stored["reward"] < 0) / len(stored), abs=1e-4),
+        "mean_reward": pytest.approx(sum(stored["reward"]) / len(stored), abs=1e-4),
+    }
     for key in ("command", "commit", "machine", "torch", "prefill"):
         assert record[key] or key == "commit"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from experiments import findings, tables
@@ -101,4 +102,23 @@ def test_every_test_drive_has_a_row_and_a_damaged_file_is_named(tmp_path: Path) 
     assert any(block == table for block in section.blocks)
     path.write_text('[{"passed": 1}]')
     with pytest.raises(StateError, match=r"tours\.json"):
+        load([tmp_path])
+
+
+def test_memories_are_told_of_where_runs_tell(tmp_path: Path) -> None:
+    for seed, left in ((1, 0.25), (2, 0.75)):
+        memory = {"of_fill": left, "negative": 0.5, "mean_reward": 0.125}
+        write_run(tmp_path, "plus-rmm", seed, memory=memory)
+    write_run(tmp_path, "plus-normm", 1)
+    (found,) = [e for e in load([tmp_path]) if e.name == "plus-rmm"]
+    actions = [run.actions / 4500 for run in found.runs]
+    (row,) = tables.memories(load([tmp_path])).rows
+    assert row[:2] == ("plus-rmm", "1, 2")
+    assert row[2].startswith(f"{np.median(actions):.3g}")
+    assert row[3:] == ("50 (25 to 75)", "50 (50 to 50)", "0.125 (0.125 to 0.125)")
+
+
+def test_figures_of_a_memory_that_cannot_be_are_refused(tmp_path: Path) -> None:
+    write_run(tmp_path, "plus-rmm", 1, memory={"of_fill": 2, "negative": 0, "mean_reward": 0})
+    with pytest.raises(StateError, match=r"run\.json: memory\.of_fill"):
         load([tmp_path])
