@@ -27,8 +27,6 @@ SIZES = (("memory", "capacity"), ("memory", "capacity_max"), ("memory", "capacit
 """What a smaller scale divides by its `memory_factor`."""
 PERIODS = (("memory", "equalise_every"), ("learning", "fit_every"))
 """What it divides by its `factor`: periods counted in episodes."""
-FULL: Tree = {"numerics": preset_tree("demo")["numerics"]}
-"""What every plan has at full scale: the demo's way to compute, measured where it runs."""
 MINI: Tree = {
     "network": {"filters": 16, "layout": "cpcccp"},
     "numerics": {
@@ -153,13 +151,16 @@ def read_plan(name: str, text: str, scale: Scale) -> Plan:
         raise ConfigError(_one_line(f"plan {name}", error)) from error
     if plan.preset:
         plan = plan.model_copy(update={"config": merged(preset_tree(plan.preset), plan.config)})
-    if scale == "mini":
-        plan = scaled(plan)
-    else:
-        plan = plan.model_copy(update={"config": merged(FULL, plan.config)})
+    plan = scaled(plan) if scale == "mini" else unscaled(plan)
     for index in range(max(1, len(plan.stages))):
         stage_config(plan, index, seed=1)
     return plan
+
+
+def unscaled(plan: Plan) -> Plan:
+    """The plan at full scale: it computes as the demo does, measured where it runs."""
+    numerics = {"numerics": preset_tree("demo")["numerics"]}
+    return plan.model_copy(update={"config": merged(numerics, plan.config)})
 
 
 def scaled(plan: Plan) -> Plan:

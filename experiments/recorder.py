@@ -6,7 +6,7 @@ import hashlib
 
 import numpy as np
 
-from experiments.records import Row
+from experiments.records import MemoryRecord, Row
 from experiments.single_process import SingleProcess, TurnDone
 from shared.rl.memory import ReplayMemory
 from shared.rl.policy import FORWARD, FORWARD_LEFT, FORWARD_RIGHT
@@ -55,17 +55,16 @@ def episode_row(loop: SingleProcess, done: TurnDone, stage: str, seconds: float)
     }
 
 
-def held(memory: ReplayMemory) -> dict[str, float] | None:
-    """What a memory is made of (`runs.MemoryInfo`); None if nothing is in it."""
+def held(memory: ReplayMemory) -> MemoryRecord | None:
+    """What a memory is made of; None if nothing is in it."""
     if not len(memory):
         return None
     rewards = memory.rows["reward"]
-    figures = {
-        "of_fill": np.mean(memory.rows["episode"] == 0),
-        "negative": np.mean(rewards < 0.0),
-        "mean_reward": np.mean(rewards),
-    }
-    return {name: round(float(value), 4) for name, value in figures.items()}
+    return MemoryRecord(
+        of_fill=round(float(np.mean(memory.rows["episode"] == 0)), 4),
+        negative=round(float(np.mean(rewards < 0.0)), 4),
+        mean_reward=round(float(np.mean(rewards)), 4),
+    )
 
 
 def memory_hash(loop: SingleProcess, before: int) -> str:

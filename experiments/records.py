@@ -86,6 +86,18 @@ WALL_TIME = "seconds"
 """The one column that two runs of the same seed may differ in."""
 
 
+class MemoryRecord(BaseModel):
+    """What the memory was made of as `run.json` was written: its entry `memory`."""
+
+    model_config = ConfigDict(frozen=True)
+
+    of_fill: float = Field(ge=0.0, le=1.0)
+    """Share of the samples that it was filled with before there were episodes."""
+    negative: float = Field(ge=0.0, le=1.0)
+    """Share with a reward below 0: a bump ahead."""
+    mean_reward: float = Field(ge=-1.0, le=1.0)
+
+
 class TourRecord(BaseModel):
     """One test drive with turns on the spot (A45): an entry of `tours.json`."""
 

@@ -354,6 +354,7 @@ class Run:
 
     def _write_run(self, *, complete: bool) -> None:
         counters, plan, made = self._loop.counters, self.plan, machine()
+        memory = held(self._loop.memory)
         run = {
             "experiment": plan.name,
             "title": plan.title,
@@ -380,7 +381,7 @@ class Run:
             "longest_run": self._totals.longest_run,
             "prefill": self._totals.prefill,
             "first_lap": self._totals.first_lap,
-            "memory": held(self._loop.memory),
+            "memory": memory and memory.model_dump(),
             "stages": self._totals.stages,
             "thesis": plan.thesis,
         }

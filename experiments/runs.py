@@ -21,6 +21,7 @@ from experiments import routes
 from experiments.records import (
     EPISODE_COLUMNS,
     EVALUATION_COLUMNS,
+    MemoryRecord,
     TourRecord,
     by_world,
     read_csv,
@@ -61,16 +62,6 @@ class Stage:
     last_episode: int
 
 
-class MemoryInfo(_Record):
-    """What the memory was made of when `run.json` was written."""
-
-    of_fill: float = Field(ge=0.0, le=1.0)
-    """Share of the samples that it was filled with before there were episodes."""
-    negative: float = Field(ge=0.0, le=1.0)
-    """Share with a reward below 0: a bump ahead."""
-    mean_reward: float = Field(ge=-1.0, le=1.0)
-
-
 class RunInfo(_Record):
     """`run.json`: what was run, where, and how far it got."""
 
@@ -102,7 +93,7 @@ class RunInfo(_Record):
     """Hash of the memory as the first episode began; empty for what keeps no such memory."""
     first_lap: dict[str, float] = Field(default_factory=dict)
     """When the frozen network first drove a lap; empty if it has not, or nobody looked."""
-    memory: MemoryInfo | None = None
+    memory: MemoryRecord | None = None
     """None for what keeps no such memory."""
     stages: tuple[StageInfo, ...]
     thesis: dict[str, Any]

@@ -23,7 +23,7 @@ from pydantic import ValidationError
 from shared.config import Config, Numerics
 from shared.errors import ConfigError, StateError
 from shared.settings import read_folder
-from shared.statefile import write_atomically
+from shared.statefile import create
 
 Role = Literal["actor", "replay", "learner"]
 WARM_UP, ROUNDS = 2, 5
@@ -50,8 +50,8 @@ def settle(config: Config, folder: Path, role: Role, common: Path | None = None)
         except ValueError as error:
             raise StateError(f"{path}: damaged: {error}") from error
     chosen = settle(config, common, role) if common else choose(config, wanted, role)
-    write_atomically(path, (json.dumps(chosen.model_dump(), indent=1) + "\n").encode())
-    return chosen
+    create(path, (json.dumps(chosen.model_dump(), indent=1) + "\n").encode())
+    return settle(config, folder, role)  # another process may have been faster
 
 
 def settle_all(config: Config, folder: Path) -> None:

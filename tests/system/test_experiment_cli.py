@@ -49,3 +49,7 @@ def test_seeds_side_by_side_divide_the_cores_and_save_what_they_did(
         assert record["fill_actions"] > 0
         assert record["machine"].endswith(f"{len(share)} cores")
         assert list(run.glob("state-*"))
+        for role in ("actor", "replay", "learner"):  # one kept choice for all that have as much
+            chosen = (run / "numerics" / f"{role}.json").read_text()
+            kept = tmp_path.glob(f"machines/*/numerics/{role}.json")
+            assert chosen in [path.read_text() for path in kept]

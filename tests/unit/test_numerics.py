@@ -48,6 +48,22 @@ def test_runs_beside_each_other_compute_alike(
     assert numerics.settle(OPEN, tmp_path / "alone", "actor").precision == "float32"
 
 
+def test_of_two_that_measure_at_once_the_first_wins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    times = iter([[1.0, 0.81], [1.0, 0.79]])
+
+    def overtaken(*_: object) -> list[float]:
+        mine = next(times)
+        if mine[1] > 0.8:  # another process settles while this one measures
+            numerics.settle(OPEN, tmp_path, "actor")
+        return mine
+
+    monkeypatch.setattr(numerics, "_seconds", overtaken)
+    assert numerics.settle(OPEN, tmp_path, "actor").precision == "bfloat16"
+    assert [path.name for path in (tmp_path / "numerics").iterdir()] == ["actor.json"]
+
+
 @pytest.mark.parametrize(("ratio", "precision"), [(0.79, "bfloat16"), (0.81, "float32")])
 def test_reduced_precision_must_be_worth_it(
     ratio: float, precision: str, monkeypatch: pytest.MonkeyPatch
