@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import difflib
 import json
-import os
 import re
-import tempfile
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
@@ -23,6 +21,7 @@ from pydantic.fields import FieldInfo
 
 from shared.config import DRIVER_ONLY, Config, Section
 from shared.errors import ConfigError, StateError
+from shared.statefile import create, write_atomically
 
 ENV_PREFIX = "CORRIDOR_"
 FILE_NAME = "config.toml"
@@ -134,8 +133,7 @@ def to_toml(config: Config) -> str:
 
 def write(config: Config, path: Path) -> None:
     """Write the resolved tree as TOML, whole or not at all."""
-    temporary = _write_beside(config, path)
-    os.replace(temporary, path)
+    write_atomically(path, _resolved(config))
 
 
 def claim(folder: Path, config: Config) -> Config:
@@ -153,7 +151,7 @@ def claim(folder: Path, config: Config) -> Config:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not path.exists():
-            _create(config, path)
+            create(path, _resolved(config))
     except OSError as error:
         raise ConfigError(f"run folder {folder}: cannot be created: {error.strerror}") from error
     stored = read_folder(folder)
@@ -175,27 +173,9 @@ def read_folder(folder: Path) -> Config:
         raise StateError(f"run folder {folder} is damaged: {error}") from error
 
 
-def _create(config: Config, path: Path) -> None:
-    """Write the file unless another process was faster."""
-    temporary = _write_beside(config, path)
-    try:
-        os.link(temporary, path)
-    except FileExistsError:
-        pass
-    finally:
-        temporary.unlink()
-
-
-def _write_beside(config: Config, path: Path) -> Path:
-    """The tree in a temporary file in the same folder, on disk."""
+def _resolved(config: Config) -> bytes:
     header = "# Resolved configuration of this run, written when the run began.\n\n"
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    with os.fdopen(handle, "w", encoding="utf-8") as stream:
-        stream.write(header + to_toml(config))
-        stream.flush()
-        os.fchmod(stream.fileno(), 0o644)
-        os.fsync(stream.fileno())
-    return Path(name)
+    return (header + to_toml(config)).encode()
 
 
 def _first_binding_difference(stored: Config, config: Config) -> tuple[str, Any, Any]:
