@@ -32,7 +32,7 @@ demo: $(VENV)/.all ## install what is needed, then run the demo until Ctrl-C
 test: check unit system ## all checks and tests but the slow ones
 
 test-full: check ## all checks and tests
-	$(PYTEST) -n 2 tests/unit tests/contract
+	$(PYTEST) -n 2 tests/unit tests/repository tests/contract
 	$(PYTEST) tests/system tests/learning
 
 check: lint ## style, types, dependency rules
@@ -44,7 +44,7 @@ lint: $(VENV)/.dev ## style only
 	$(BIN)/ruff format --check .
 
 unit: $(VENV)/.dev ## fast tests, two at a time
-	$(PYTEST) -n 2 -m "not slow" tests/unit tests/contract
+	$(PYTEST) -n 2 -m "not slow" tests/unit tests/repository tests/contract
 
 # Real processes wait for each other: one test at a time.
 system: $(VENV)/.dev ## tests with real processes and a real router, without the slow ones

@@ -25,15 +25,15 @@ from statistics import mean
 from typing import Any
 
 from benchmarks.frame import Bar, report, table
-from experiments import places
-from experiments.choosers import Chooser, greedy, uniform
+from experiments.drives import places
+from experiments.drives.choosers import Chooser, greedy, uniform
+from experiments.drives.frozen_drives import evaluate
+from experiments.drives.traces import Figures
 from experiments.environment import CorridorEnv
-from experiments.evaluation import evaluate
-from experiments.provenance import commit
+from experiments.runs.provenance import commit
 from experiments.single_process import SingleProcess
-from experiments.traces import Figures
-from services.robot_driver.sim import SimRobot
-from services.robot_driver.world import load_world
+from services.robot_driver.simulated.sim import SimRobot
+from services.robot_driver.simulated.world import load_world
 from shared.config import Config
 
 LONG = True

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from benchmarks import frames
 from benchmarks.frame import Bar, Mode, interleaved, mode_of, report, rounds_of, table
-from experiments.provenance import ROOT
+from experiments.runs.provenance import ROOT
 from shared.config import MemoryConfig, Numerics
 from shared.rl.memory import SAMPLE, ReplayMemory
 from shared.rl.predictor import Predictor

@@ -18,10 +18,10 @@ from statistics import median
 
 from benchmarks.frame import Bar, Mode, mode_of, report, rounds_of, table
 from experiments.single_process import SingleProcess
-from services.monitor.supervisor import ChildSpec, Supervisor
-from services.monitor.up import STAGES, child_specs, free_endpoint
-from services.robot_driver.sim import SimRobot
-from services.robot_driver.world import load_world
+from services.launcher.supervisor import ChildSpec, Supervisor
+from services.launcher.up import STAGES, child_specs, free_endpoint
+from services.robot_driver.simulated.sim import SimRobot
+from services.robot_driver.simulated.world import load_world
 from shared import settings
 from shared.bus import Bus, Inbox
 from shared.config import ActorNumerics, Config, Numerics

@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from benchmarks.frame import Mode
 from experiments.single_process import SingleProcess
-from services.robot_driver.sim import SimRobot
-from services.robot_driver.world import load_world
+from services.robot_driver.simulated.sim import SimRobot
+from services.robot_driver.simulated.world import load_world
 from shared.config import Config, LearnerNumerics, LearningConfig, NetworkConfig
 from shared.rl.learning import Trainer
 from shared.rl.memory import MIRROR, SampleStore

@@ -20,7 +20,7 @@ from statistics import median
 import numpy as np
 
 from benchmarks.frame import Bar, Mode, mode_of, report, table
-from experiments.provenance import ROOT
+from experiments.runs.provenance import ROOT
 from shared.config import MemoryConfig
 from shared.rl.memory import SAMPLE, ReplayMemory
 from shared.rl.retention import discard, recompute_marks

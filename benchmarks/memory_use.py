@@ -21,9 +21,9 @@ from statistics import median
 from benchmarks import frames
 from benchmarks.frame import Bar, Mode, mode_of, report, table
 from benchmarks.prefilled import bus, fill, system
+from services.launcher.supervisor import Supervisor
+from services.launcher.up import free_endpoint
 from services.monitor.heartbeats import Reader, Snapshot
-from services.monitor.supervisor import Supervisor
-from services.monitor.up import free_endpoint
 from shared import settings
 from shared.config import Config
 from shared.numerics import settle_all

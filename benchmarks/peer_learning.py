@@ -21,8 +21,8 @@ from services.actor.actor import Actor
 from services.replay import numbering
 from services.replay.numbering import Counters
 from services.robot_driver.driver import Driver
-from services.robot_driver.sim import SimRobot
-from services.robot_driver.world import load_world
+from services.robot_driver.simulated.sim import SimRobot
+from services.robot_driver.simulated.world import load_world
 from shared.config import ActorNumerics, Config, LearnerNumerics
 from shared.messages import Episode
 from shared.numerics import choose

@@ -33,7 +33,7 @@ from benchmarks.frame import (
     times_table,
 )
 from benchmarks.transfer import EPISODE_SAMPLES, PATIENCE_S, bus, make_episode, system
-from services.monitor.up import free_endpoint
+from services.launcher.up import free_endpoint
 from shared.bus import Bus
 from shared.config import Config
 from shared.keys import EPISODE, MINI_BATCH

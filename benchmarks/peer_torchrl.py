@@ -21,7 +21,7 @@ from torchrl.data import LazyMemmapStorage, RemoteTensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.data.replay_buffers.writers import RoundRobinWriter
 
-from experiments.provenance import ROOT
+from experiments.runs.provenance import ROOT
 from shared.messages import IMAGE_SHAPE, Episode
 
 CLIENT, SERVER = "client", "replay"

@@ -27,8 +27,8 @@ from benchmarks import frames, peers
 from benchmarks.distribution import connected
 from benchmarks.frame import Bar, Mode, Times, mode_of, report, rounds_of, speedup, table
 from benchmarks.transfer import learner_state
-from services.monitor.supervisor import Supervisor
-from services.monitor.up import child_specs, free_endpoint
+from services.launcher.supervisor import Supervisor
+from services.launcher.up import child_specs, free_endpoint
 from shared import settings
 from shared.bus import Bus, Inbox
 from shared.config import Config

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from services.monitor.supervisor import ChildSpec, Supervisor
-from services.monitor.up import STAGES, child_specs
+from services.launcher.supervisor import ChildSpec, Supervisor
+from services.launcher.up import STAGES, child_specs
 from services.replay.storage import Storage
 from shared import settings
 from shared.bus import Bus

@@ -23,9 +23,9 @@ import numpy as np
 
 from benchmarks.distribution import connected
 from benchmarks.frame import Bar, Mode, mode_of, report, table
-from experiments.provenance import ROOT
-from services.monitor.supervisor import Supervisor
-from services.monitor.up import child_specs, free_endpoint
+from experiments.runs.provenance import ROOT
+from services.launcher.supervisor import Supervisor
+from services.launcher.up import child_specs, free_endpoint
 from shared import settings
 from shared.bus import Bus
 from shared.config import Config

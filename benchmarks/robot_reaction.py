@@ -18,7 +18,7 @@ from statistics import median
 
 from benchmarks.frame import Bar, Mode, mode_of, report, rounds_of, table
 from benchmarks.robot_rig import Rig
-from services.monitor.up import free_endpoint
+from services.launcher.up import free_endpoint
 from services.robot_driver.driver import action_velocity
 from services.robot_driver.emulation.dynamics import ROBOTINO
 from shared import settings

@@ -18,7 +18,7 @@ from typing import Any, Self, TypeVar
 
 import httpx
 
-from experiments.provenance import ROOT
+from experiments.runs.provenance import ROOT
 from shared import settings
 from shared.bus import Bus
 from shared.config import Config

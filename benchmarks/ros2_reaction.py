@@ -18,7 +18,7 @@ from statistics import median
 
 from benchmarks.frame import Bar, Mode, mode_of, report, rounds_of, table
 from benchmarks.ros2_rig import Ros2Rig
-from services.monitor.up import free_endpoint
+from services.launcher.up import free_endpoint
 from services.robot_driver.driver import action_velocity
 from services.robot_driver.emulation.dynamics import CREATE3, ROBOTINO, STEP_S
 from shared import settings

@@ -17,8 +17,8 @@ import numpy as np
 from benchmarks.frame import Bar, Mode, mode_of, report, table
 from services.robot_driver.driver import action_velocity
 from services.robot_driver.robot import Velocity
-from services.robot_driver.sim import SimRobot
-from services.robot_driver.world import load_world
+from services.robot_driver.simulated.sim import SimRobot
+from services.robot_driver.simulated.world import load_world
 from shared.config import Config, RobotConfig
 
 SIZES = ((75, 50), (150, 100))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 
-from services.monitor.tether import tether
+from services.launcher.tether import tether
 from shared.bus import Bus
 from shared.config import BusConfig
 from shared.keys import ACTION, OBSERVATION

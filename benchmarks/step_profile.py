@@ -27,12 +27,12 @@ from benchmarks.distribution import (
 )
 from benchmarks.frame import Mode, mode_of, table
 from benchmarks.run_all import PAGE, renewed
-from experiments.provenance import machine
+from experiments.runs.provenance import machine
 from experiments.single_process import SingleProcess
-from services.monitor.supervisor import Supervisor
-from services.monitor.up import child_specs, free_endpoint
-from services.robot_driver.sim import SimRobot
-from services.robot_driver.world import load_world
+from services.launcher.supervisor import Supervisor
+from services.launcher.up import child_specs, free_endpoint
+from services.robot_driver.simulated.sim import SimRobot
+from services.robot_driver.simulated.world import load_world
 from shared import settings
 from shared.config import Config
 

@@ -26,7 +26,7 @@ from benchmarks.frame import (
     times_table,
 )
 from benchmarks.frame import table as as_table
-from experiments.provenance import ROOT
+from experiments.runs.provenance import ROOT
 from shared.config import Config, LearnerNumerics, LearningConfig, Numerics
 from shared.numerics import choose
 from shared.rl.learning import Trainer

@@ -27,8 +27,8 @@ import numpy as np
 
 from benchmarks.frame import Bar, Mode, mode_of, report, rounds_of, table
 from benchmarks.prefilled import EPISODE_SAMPLES, LIFE, bus, fill, make_episode, system
+from services.launcher.up import free_endpoint
 from services.learner.mirror import Mirror
-from services.monitor.up import free_endpoint
 from shared import settings
 from shared.bus import Bus, Inbox
 from shared.config import ActorNumerics, Config

@@ -17,8 +17,8 @@ from gymnasium.error import InvalidAction, ResetNeeded
 
 from services.robot_driver.driver import Driver
 from services.robot_driver.robot import Pose
-from services.robot_driver.sim import SimRobot
-from services.robot_driver.world import WORLDS, World, load_world
+from services.robot_driver.simulated.sim import SimRobot
+from services.robot_driver.simulated.world import WORLDS, World, load_world
 from shared.config import Config
 from shared.messages import Observation, image_array
 from shared.rl.policy import ACTIONS

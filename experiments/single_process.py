@@ -17,7 +17,7 @@ from experiments.environment import LIFE, CorridorEnv
 from services.actor.actor import Actor
 from services.replay import numbering
 from services.replay.numbering import Commit, Counters
-from services.robot_driver.sim import SimRobot
+from services.robot_driver.simulated.sim import SimRobot
 from shared.config import Config
 from shared.messages import Episode, Observation, RobotProgress
 from shared.rl.learning import Trained, Trainer

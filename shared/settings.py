@@ -37,7 +37,7 @@ def load(
     """The configuration all sources together give.
 
     Args:
-        preset: name of one in `experiments/presets`, or the path of a TOML file.
+        preset: name of one in `shared/presets`, or the path of a TOML file.
         file: path of a TOML file; wins over the preset.
         overrides: `section.key=value` texts from the command line, later ones win.
         env: the environment; `CORRIDOR_<SECTION>__<KEY>` is read from it.
@@ -72,7 +72,7 @@ def from_toml(text: str, source: str) -> Config:
 
 def preset_names() -> list[str]:
     """Names of the presets that come with the package."""
-    folder = resources.files("experiments").joinpath("presets")
+    folder = resources.files("shared").joinpath("presets")
     names = (entry.name for entry in folder.iterdir())
     return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
 
@@ -273,7 +273,7 @@ def _read_preset(preset: str) -> tuple[Tree, str]:
         raise ConfigError(
             f"--preset: expected one of {known} or a .toml file, got {preset!r}{hint}"
         )
-    text = resources.files("experiments").joinpath("presets", f"{preset}.toml").read_bytes()
+    text = resources.files("shared").joinpath("presets", f"{preset}.toml").read_bytes()
     return _parse(text, f"preset {preset}"), f"preset {preset}"
 
 

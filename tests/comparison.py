@@ -12,8 +12,8 @@ from safetensors import safe_open
 
 from experiments.single_process import SingleProcess
 from services.replay.storage import Storage
-from services.robot_driver.sim import SimRobot
-from services.robot_driver.world import load_world
+from services.robot_driver.simulated.sim import SimRobot
+from services.robot_driver.simulated.world import load_world
 from shared.config import Config
 from shared.messages import WorldChange
 from shared.rl.memory import ReplayMemory

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 from waiting import wait_until
 
-from services.robot_driver.emulation.faults import Faults
 from services.robot_driver.emulation.robotino import EmulatedRobotino, RobotinoServer
+from services.robot_driver.emulation.robotino_faults import Faults
 from services.robot_driver.emulation.ros2 import EmulatedRos2
 from services.robot_driver.emulation.ros2_faults import Ros2Faults
 from services.robot_driver.robot import NotReady, Pose, Robot

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from experiments import routes
+from experiments.drives import routes
+from experiments.drives.routes import Event
+from experiments.drives.traces import Trace
 from experiments.records import EPISODE_COLUMNS, EVALUATION_COLUMNS, Row, write_csv
-from experiments.routes import Event
-from experiments.traces import Trace
 
 FACTOR = 10.0
 AFTER = {"plus-normm-fit": "plus-normm", "plus-minus": "plus-rmm", "i16c": "plus-minus"}

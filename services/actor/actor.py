@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from services.actor.decision import decide
 from shared.config import Config
 from shared.messages import Action, Episode, Observation, RobotProgress, image_array
+from shared.rl.decision import decide
 from shared.rl.episode import Ending, OpenEpisode, Release, Step, stale_steps, with_current_max_q
 from shared.rl.policy import Values
 from shared.rl.predictor import Predictor

@@ -14,7 +14,7 @@ import sys
 import time
 
 from services.monitor.heartbeats import Reader, Snapshot
-from services.monitor.live import learner_doing, replay_doing
+from services.monitor.words import learner_doing, replay_doing
 from shared import settings
 from shared.bus import Bus
 from shared.config import Config

@@ -13,8 +13,8 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 
 from services.monitor.heartbeats import Reader, Snapshot
-from services.monitor.live import by_action, duration, fitness, learner_doing, replay_doing
-from services.monitor.live import threshold as threshold_text
+from services.monitor.words import by_action, duration, fitness, learner_doing, replay_doing
+from services.monitor.words import threshold as threshold_text
 from shared.bus import Bus
 from shared.config import Config
 from shared.errors import BadMessage, BusError

@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Literal
 
-from services.robot_driver.changes import Changes, Outcome, described
 from services.robot_driver.recovery import Halted, WatchedRobot, back_off, let_go
 from services.robot_driver.robot import STANDSTILL, NotReady, Pose, Robot, Velocity
 from services.robot_driver.safety import Safety
+from services.robot_driver.world_changes import Changes, Outcome, described
 from shared.config import Config
 from shared.messages import (
     MAX_FAULTS,

@@ -21,8 +21,8 @@ from shared.messages import Action, Observation, RobotCommand, WorldChange
 from shared.service import TICK_S, Service, Stopped, new_life, service
 
 if TYPE_CHECKING:
-    from services.robot_driver.sim import Laps, SimRobot
-    from services.robot_driver.world import Obstacle, World
+    from services.robot_driver.simulated.sim import Laps, SimRobot
+    from services.robot_driver.simulated.world import Obstacle, World
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ STATE, WORLD = "state.msgpack", "world.msgpack"
 
 
 LINKS = {"robotino": "RobotinoLink", "ros2": "Ros2Link"}
-"""Kinds of real robots: a module of this package and a class in it."""
+"""Kinds of real robots: a module of `real` and a class in it."""
 
 
 def make_robot(config: Config) -> Robot:
@@ -54,7 +54,7 @@ def make_robot(config: Config) -> Robot:
 
 
 def _real(config: Config) -> Robot:
-    from services.robot_driver.hardware import HardwareRobot
+    from services.robot_driver.real.hardware import HardwareRobot
 
     kind = config.robot.kind
     for name in ("camera_stale_s", "odometry_stale_s", "bumper_stale_s"):
@@ -64,7 +64,7 @@ def _real(config: Config) -> Robot:
                 "than it could",
                 name,
             )
-    module = importlib.import_module(f"services.robot_driver.{kind}")
+    module = importlib.import_module(f"services.robot_driver.real.{kind}")
     link = getattr(module, LINKS[kind])(config)
     try:
         return HardwareRobot(config.robot, link)
@@ -73,8 +73,8 @@ def _real(config: Config) -> Robot:
 
 
 def _simulated(config: Config) -> Robot:
-    from services.robot_driver.sim import SimRobot
-    from services.robot_driver.world import WorldError, load_world
+    from services.robot_driver.simulated.sim import SimRobot
+    from services.robot_driver.simulated.world import WorldError, load_world
 
     try:
         world = load_world(config.robot.world)

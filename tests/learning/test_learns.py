@@ -7,8 +7,8 @@ from statistics import mean
 import pytest
 
 from experiments.single_process import SingleProcess
-from services.robot_driver.sim import SimRobot
-from services.robot_driver.world import load_world
+from services.robot_driver.simulated.sim import SimRobot
+from services.robot_driver.simulated.world import load_world
 from shared.config import Config
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]

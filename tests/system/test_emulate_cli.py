@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from services import cli
+from services.cli import main as cli
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
 

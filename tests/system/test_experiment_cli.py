@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from waiting import wait_until
 
-from experiments.experiment import shares_of
+from experiments.runs.schedule import shares_of
 
 pytestmark = pytest.mark.system
 

@@ -11,7 +11,7 @@ import pytest
 from fakes import answering, fake_service, message
 from waiting import wait_until
 
-from services import cli
+from services.cli import main as cli
 from shared.bus import Bus
 from shared.config import Config
 from shared.keys import LEARNER_STATE, REPLAY_STATE, ROBOT_COMMAND, ROBOT_WORLD

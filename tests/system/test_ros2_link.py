@@ -13,11 +13,11 @@ import pytest
 from robots import BRIDGE, RMW_ZENOH, real_time, ros2_emulator
 from waiting import wait_until
 
-from services.robot_driver import cdr, ros2_names
 from services.robot_driver.emulation.ros2_faults import Ros2Faults
+from services.robot_driver.real import cdr, ros2_names
+from services.robot_driver.real.ros2 import Ros2Link
+from services.robot_driver.real.ros2_names import Attachment, Endpoint
 from services.robot_driver.robot import STANDSTILL, Pose, RobotFault, Velocity
-from services.robot_driver.ros2 import Ros2Link
-from services.robot_driver.ros2_names import Attachment, Endpoint
 from shared.errors import RouterMissing
 from shared.foreign_bus import ForeignBus, RawInbox, RawPublisher, RawSample
 

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 from waiting import wait_until
 
+from services.launcher.supervisor import ChildSpec, ChildStatus, Ending, Supervisor
 from services.monitor.running import is_up, locked
-from services.monitor.supervisor import ChildSpec, ChildStatus, Ending, Supervisor
 from shared.errors import ConfigError
 
 pytestmark = pytest.mark.system

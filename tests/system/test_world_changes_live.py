@@ -10,7 +10,7 @@ from cluster import ALL, Cluster, make_config
 from comparison import assert_equal, distributed, single_process
 from waiting import wait_until
 
-from services import cli
+from services.cli import main as cli
 from shared.bus import Inbox
 from shared.config import Config
 from shared.keys import OBSERVATION, ROBOT_STATE, ROBOT_WORLD

@@ -8,11 +8,11 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from services.monitor import up
-from services.monitor.supervisor import ChildSpec
+from services.launcher import up
+from services.launcher.supervisor import ChildSpec
 from shared.config import Config
 
-TETHERED = "from services.monitor.tether import tether; tether()\n"
+TETHERED = "from services.launcher.tether import tether; tether()\n"
 
 
 def main() -> int:

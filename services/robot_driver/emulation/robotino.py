@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 from services.robot_driver.emulation.dynamics import ROBOTINO, STEP_S
-from services.robot_driver.emulation.faults import Faults
+from services.robot_driver.emulation.robotino_faults import Faults
 from services.robot_driver.emulation.world import EmulatedRobot, Truth, camera_of
 from services.robot_driver.robot import Velocity
 from shared.config import RobotConfig

@@ -22,14 +22,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from services.robot_driver import cdr, ros2_names
-from services.robot_driver.cdr import VelocityType
 from services.robot_driver.emulation.dynamics import CREATE3, ROBOTINO, STEP_S
 from services.robot_driver.emulation.ros2_faults import TRUTH_KEY, Ros2Faults
 from services.robot_driver.emulation.ros2_network import Network
 from services.robot_driver.emulation.world import EmulatedRobot
-from services.robot_driver.link import Battery
-from services.robot_driver.picture import RgbImage
+from services.robot_driver.real import cdr, ros2_names
+from services.robot_driver.real.cdr import VelocityType
+from services.robot_driver.real.link import Battery
+from services.robot_driver.real.picture import RgbImage
 from shared.config import RobotConfig
 from shared.errors import BadMessage, ConfigError, RouterMissing
 from shared.foreign_bus import RawInbox, RawSample

@@ -6,10 +6,10 @@ import secrets
 import time
 from typing import Literal
 
-from services.robot_driver import cdr, ros2_names
-from services.robot_driver.cdr import VelocityType
 from services.robot_driver.emulation.ros2_faults import FAULTS_KEY, TRUTH_KEY
-from services.robot_driver.ros2_names import Attachment, Endpoint
+from services.robot_driver.real import cdr, ros2_names
+from services.robot_driver.real.cdr import VelocityType
+from services.robot_driver.real.ros2_names import Attachment, Endpoint
 from shared.config import Ros2Config
 from shared.foreign_bus import ForeignBus, RawInbox, RawPublisher, Undeclare
 

@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from services.robot_driver.emulation.dynamics import STEP_S, BaseDynamics, EmulatedBase, Given
 from services.robot_driver.robot import Pose, Velocity
-from services.robot_driver.sim import SimRobot
-from services.robot_driver.world import WorldError, load_world
+from services.robot_driver.simulated.sim import SimRobot
+from services.robot_driver.simulated.world import WorldError, load_world
 from shared.config import CameraConfig, RobotConfig
 from shared.errors import ConfigError
 

@@ -1,0 +1,1 @@
+"""A baseline: DQN of Stable-Baselines3 in the same corridors."""

@@ -1,0 +1,1 @@
+"""Driving without learning, measured: starts, routes, figures of drives, test drives."""

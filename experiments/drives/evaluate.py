@@ -1,0 +1,122 @@
+"""`corridor evaluate`: what the network of a run can do, beside planner and random actions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from experiments import records
+from experiments.drives import routes
+from experiments.drives.choosers import Chooser, Planned, greedy, uniform
+from experiments.drives.frozen_drives import evaluate
+from experiments.drives.traces import Figures
+from experiments.environment import CorridorEnv
+from services.commander import frozen
+from services.robot_driver.simulated.world import WorldError
+from shared.config import Config
+from shared.errors import ConfigError
+
+LABEL = "evaluate"
+SHOWN = {
+    "bumps_per_1000": "bumps per 1,000 actions",
+    "bumps_per_100m": "bumps per 100 m",
+    "mean_run": "mean bump-free run, actions",
+    "longest_run": "longest bump-free run, actions",
+    "fitness": "fitness (runs capped at 500)",
+    "laps_left_per_1000": "laps left per 1,000 actions",
+    "laps_right_per_1000": "laps right per 1,000 actions",
+    "distance": "distance from 50 actions ago, of the farthest possible",
+    "coverage": "free cells visited",
+    "circling": "actions spent circling",
+}
+SHARES = ("distance", "coverage", "circling")
+
+
+def run(path: Path, config: Config, starts: int, actions: int, out: Path) -> None:
+    """Evaluate in the configured world; print a table, write `evaluation.csv`, routes and pictures.
+
+    Args:
+        path: Folder of a run, or a file of weights.
+        config: World, robot and shape of the network.
+        starts: Number of drives.
+        actions: Of each drive.
+        out: Folder, made if missing.
+
+    Raises:
+        ConfigError: No such run, no such world, another shape of network, or an unwritable folder.
+        StateError: The network's file is damaged.
+    """
+    weights = frozen.read(frozen.find(path))
+    network = greedy(weights.predictor(config.network))
+    try:
+        env = CorridorEnv(config=config)
+    except WorldError as error:
+        raise ConfigError(f"robot.world: {error}") from error
+    try:
+        drivers = (
+            ("network", lambda: network), ("random", lambda: uniform),
+            ("planner", lambda: Planned(env.world, config.robot)),
+        )  # fmt: skip
+        found = {name: _drive(env, make, starts, actions, name, out) for name, make in drivers}
+    finally:
+        env.close()
+    rows = [_row(name, config, weights, figures) for name, figures in found.items()]
+    records.write_csv(out / "evaluation.csv", records.EVALUATION_COLUMNS, rows)
+    Console().print(table(config.robot.world, found))
+
+
+def table(world: str, found: Mapping[str, Figures]) -> Table:
+    """Figures by driver, one row each."""
+    actions = round(next(iter(found.values()))["actions"])
+    shown = Table(title=f"{world}: {actions} actions without learning", title_justify="left")
+    shown.add_column("figure")
+    for driver in found:
+        shown.add_column(driver, justify="right")
+    for name, text in SHOWN.items():
+        shown.add_row(text, *(_text(name, figures[name]) for figures in found.values()))
+    return shown
+
+
+def _drive(
+    env: CorridorEnv,
+    make: Callable[[], Chooser],
+    starts: int,
+    actions: int,
+    name: str,
+    out: Path,
+) -> Figures:
+    """Drive from all starts; write the ways."""
+    done = evaluate(env, make(), starts, actions)
+    title = (
+        f"{env.world.name}: {name}, {done.figures['bumps_per_1000']:.1f} bumps per 1,000 actions"
+    )
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        routes.write(out / f"route-{name}.npz", routes.Route(done.traces[0]))
+        routes.draw(out / f"routes-{name}.png", env.world, done.traces, title)
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot be written: {error.strerror}") from error
+    return done.figures
+
+
+def _row(name: str, config: Config, weights: frozen.Frozen, figures: Figures) -> records.Row:
+    """The random driver and the planner have learnt nothing."""
+    learnt = name == "network"
+    known = {"episode": weights.episode, "train_steps": weights.train_steps} if learnt else {}
+    return {
+        "label": LABEL if learnt else "reference",
+        "driver": name,
+        "world": config.robot.world,
+        **{key: value for key, value in known.items() if value is not None},
+        **{key: round(value, 6) for key, value in figures.items()},
+        "seconds": 0.0,
+    }
+
+
+def _text(name: str, value: float) -> str:
+    if name in SHARES:
+        return f"{value:.1%}"
+    return f"{value:.0f}" if name == "longest_run" else f"{value:.2f}"

@@ -1,0 +1,1 @@
+"""Experiments as data: one TOML file for each, and what reads and scales them."""

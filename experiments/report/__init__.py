@@ -1,0 +1,1 @@
+"""What runs gave: tables, figures, findings, pages."""

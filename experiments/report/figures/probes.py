@@ -1,0 +1,117 @@
+"""Images and the rewards that networks predict for them (Fig 4.7, 4.10, 4.16, 4.17, 4.19)."""
+
+from __future__ import annotations
+
+import string
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from experiments.report.figures.style import ACTION_COLOURS, GREY, INK, sheet, styled
+from experiments.report.run_folder import Experiment, Floats, Probes
+
+COLUMNS = 6
+SHOWN = ("left", "forward", "right")
+"""Bars stand where their action leads."""
+_ORDER = (1, 0, 2)
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """What one network predicts for the images of a set."""
+
+    title: str
+    values: Floats
+
+
+def chosen(count: int, wanted: int) -> list[int]:
+    """Indices spread evenly over a set of images, in its order."""
+    return sorted({round(i) for i in np.linspace(0, count - 1, min(count, wanted))})
+
+
+@styled
+def predictions(probes: Probes, networks: Sequence[Predictions], wanted: int) -> Figure:
+    """Up to `wanted` images, below each the rewards by every network, one row of bars each."""
+    indices = chosen(len(probes.images), wanted)
+    blocks = -(-len(indices) // COLUMNS)
+    rows = 1 + len(networks)
+    figure = sheet(blocks * (0.95 + 0.75 * len(networks)) + 0.35)
+    ratios = [1.05] + [0.85] * len(networks)
+    grid = figure.subplots(blocks * rows, COLUMNS, height_ratios=ratios * blocks, squeeze=False)
+    for cell in range(blocks * COLUMNS):
+        block, column = divmod(cell, COLUMNS)
+        cells = [grid[block * rows + row, column] for row in range(rows)]
+        if cell >= len(indices):
+            for axes in cells:
+                axes.set_axis_off()
+            continue
+        _image(cells[0], probes.images[indices[cell]], string.ascii_lowercase[cell])
+        for axes, network in zip(cells[1:], networks, strict=True):
+            _bars(axes, network.values[indices[cell]], network.title if column == 0 else None)
+    handles = [Patch(color=ACTION_COLOURS[name]) for name in SHOWN]
+    figure.legend(handles, SHOWN, loc="outside lower center", ncols=3)
+    return figure
+
+
+def _image(axes: Axes, image: npt.NDArray[np.uint8], letter: str) -> None:
+    height, width = image.shape
+    axes.imshow(image, cmap="gray", vmin=0, vmax=255, extent=(0, width, height, 0))
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.grid(visible=False)
+    axes.spines[["left", "bottom"]].set_visible(False)
+    axes.text(0.04, 0.93, letter, transform=axes.transAxes, va="top", color="black",
+              bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.2})  # fmt: skip
+
+
+def _bars(axes: Axes, values: Floats, title: str | None) -> None:
+    heights = [float(values[i]) for i in _ORDER]
+    axes.bar(range(3), heights, color=[ACTION_COLOURS[name] for name in SHOWN], width=0.75)
+    axes.axhline(0.0, color=INK, linewidth=0.7)
+    axes.set_ylim(-1.05, 1.05)
+    axes.set_xlim(-0.6, 2.6)
+    axes.set_xticks([])
+    axes.set_yticks([-1, 0, 1], ["−1", "0", "1"] if title is not None else ["", "", ""])
+    axes.spines["bottom"].set_visible(False)
+    axes.tick_params(length=2, colors=GREY, labelcolor=INK)
+    if title is not None:
+        axes.set_ylabel(title)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Predictions of one network, and whose they are."""
+
+    seed: int
+    weights: str
+    """Which weights of that seed, in words."""
+    probes: Probes
+
+
+def last(experiment: Experiment, world: str) -> Choice | None:
+    """Predictions at the end of the newest stage, of the lowest seed that has them."""
+    for run in experiment.runs:
+        labelled = {probes.label: probes for probes in run.probes}
+        for stage in reversed(run.info.stages):
+            if found := labelled.get(f"{stage.name}-{world}"):
+                return Choice(run.info.seed, f"weights at the end of stage {stage.name}", found)
+    return None
+
+
+def best(experiment: Experiment, world: str) -> Choice | None:
+    """Predictions by the weights of the longest way without a bump, of the lowest seed."""
+    for run in experiment.runs:
+        for probes in run.probes:
+            if probes.label == f"best-{world}":
+                return Choice(run.info.seed, "best weights", probes)
+    return None
+
+
+def same_images(ours: Probes, theirs: Probes) -> bool:
+    """Whether two networks were asked about the same pictures."""
+    return np.array_equal(ours.images, theirs.images)

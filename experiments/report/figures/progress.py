@@ -1,0 +1,151 @@
+"""Fitness and loss over episodes (Fig 4.4, 4.5, 4.9, 4.12, 4.14)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from experiments.report.figures.style import (
+    GREEN,
+    SWITCH,
+    colours,
+    draw_band,
+    draw_stages,
+    legend_below,
+    sheet,
+    styled,
+)
+from experiments.report.run_folder import Experiment, Run
+from experiments.report.statistics import (
+    Band,
+    Curve,
+    band_of_blocks,
+    block_means,
+    from_the_start,
+    with_gaps,
+)
+
+FULL = 500
+"""Highest fitness of an episode (A37)."""
+LONGEST_LINE = 3
+"""Windows without a value that a line still crosses; a stage without training is a gap."""
+ZOOM = 0.06
+"""Part of all episodes on each side of the best point that the lower plot shows."""
+
+
+def curve_of(run: Run, column: str) -> Curve:
+    """Means of a column over the run's window of episodes."""
+    return block_means(run.episodes.numbers("episode"), run.episodes.numbers(column), run.window)
+
+
+def band_of(experiment: Experiment, column: str) -> Band:
+    """All seeds of an experiment."""
+    band = band_of_blocks([curve_of(run, column) for run in experiment.runs])
+    return with_gaps(band, LONGEST_LINE * experiment.runs[0].window)
+
+
+@styled
+def fitness(experiment: Experiment) -> Figure:
+    """Fitness in two plots, as in the thesis: everything, and around the best episodes."""
+    figure = sheet(4.6)
+    above, below = figure.subplots(2, 1)
+    colour, window = colours([experiment.name])[experiment.name], experiment.runs[0].window
+    draw_band(above, band_of(experiment, "fitness"), colour, f"mean of {window} episodes")
+    for run in experiment.runs:
+        _full_episodes(above, run)
+    draw_stages(above, experiment.runs[0].stages)
+    _labels(above)
+    _around_the_best(below, experiment, colour)
+    figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return figure
+
+
+def _full_episodes(axes: Axes, run: Run) -> None:
+    episodes = run.episodes.numbers("episode")
+    full = episodes[run.episodes.numbers("fitness") >= FULL]
+    label = "" if GREEN in [line.get_color() for line in axes.lines[1:]] else f"{FULL} reached"
+    axes.plot(full, np.full(len(full), FULL), ".", color=GREEN, markersize=3, label=label)
+
+
+def _around_the_best(axes: Axes, experiment: Experiment, colour: str) -> None:
+    """Single episodes and their means where one seed was best."""
+    best = max(experiment.runs, key=lambda run: max(curve_of(run, "fitness")[1], default=0.0))
+    places, means = curve_of(best, "fitness")
+    episodes, heights = (best.episodes.numbers(name) for name in ("episode", "fitness"))
+    if len(means):
+        reach = max(ZOOM * (episodes[-1] - episodes[0]), 2.0 * best.window)
+        middle = places[np.argmax(means)] - best.window / 2
+        near = np.abs(episodes - middle) <= reach
+        full = near & (heights >= FULL)
+        axes.plot(episodes[near], heights[near], ".", color="#9a9a9a", markersize=2.5)
+        axes.plot(episodes[full], heights[full], ".", color=GREEN, markersize=4)
+        shown = np.abs(places - middle) <= reach
+        axes.plot(places[shown], means[shown], color=colour, marker="o", markersize=3)
+    axes.set_title(f"around the best episodes of seed {best.info.seed}; grey: single episodes")
+    _labels(axes)
+
+
+def _labels(axes: Axes) -> None:
+    axes.set_xlabel("episode")
+    axes.set_ylabel("fitness (actions)")
+    axes.set_ylim(0, FULL * 1.06)
+
+
+@styled
+def loss(experiment: Experiment) -> Figure:
+    """Mean loss over the window, logarithmic because it falls by orders of magnitude."""
+    figure = sheet(2.5)
+    axes = figure.subplots()
+    colour, window = colours([experiment.name])[experiment.name], experiment.runs[0].window
+    draw_band(axes, band_of(experiment, "loss"), colour, f"mean of {window} episodes")
+    draw_stages(axes, experiment.runs[0].stages)
+    axes.set_yscale("log")
+    axes.set_xlabel("episode")
+    axes.set_ylabel("loss (squared error)")
+    axes.legend(loc="upper right")
+    return figure
+
+
+@styled
+def continued(before: Experiment, after: Experiment) -> Figure:
+    """Fitness of an experiment and of the one that went on from it (Fig 4.5)."""
+    figure = sheet(2.9)
+    axes = figure.subplots()
+    both = colours([before.name, after.name])
+    first, second = band_of(before, "fitness"), band_of(after, "fitness")
+    draw_band(axes, first, both[before.name], before.name)
+    draw_band(axes, second, both[after.name], after.name)
+    start = after.runs[0].episodes.numbers("episode")[0]
+    axes.axvline(start - 0.5, color=SWITCH, linestyle="--", linewidth=1.0)
+    _mean_labels(axes, (first, second), before.runs[0].window)
+    legend_below(axes, 2)
+    return figure
+
+
+@styled
+def compared(experiments: Sequence[Experiment]) -> Figure:
+    """Fitness of several experiments over their own episodes, each from 1 (Fig 4.12)."""
+    figure = sheet(3.1)
+    axes = figure.subplots()
+    named = colours(experiment.name for experiment in experiments)
+    bands = [
+        from_the_start(band_of(e, "fitness"), e.runs[0].episodes.numbers("episode")[0])
+        for e in experiments
+    ]
+    for experiment, band in zip(experiments, bands, strict=True):
+        draw_band(axes, band, named[experiment.name], experiment.name)
+    _mean_labels(axes, bands, experiments[0].runs[0].window)
+    axes.set_xlabel("episode of the run")
+    legend_below(axes, 3)
+    return figure
+
+
+def _mean_labels(axes: Axes, bands: Sequence[Band], window: int) -> None:
+    """Means stay far below 500 in hard experiments: the axis ends a little above the highest."""
+    highest = max(float(np.nanmax(band.high, initial=0.0)) for band in bands)
+    axes.set_xlabel("episode")
+    axes.set_ylabel(f"fitness (actions), mean of {window}")
+    axes.set_ylim(0, 1.1 * highest if highest else FULL)

@@ -1,0 +1,137 @@
+"""How figures look: sizes, a palette that colour-blind people can tell apart, stages."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterable
+from functools import wraps
+from itertools import pairwise
+from typing import ParamSpec
+
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from PIL import Image
+
+from experiments.report.run_folder import Stage
+from experiments.report.statistics import Band
+
+P = ParamSpec("P")
+
+WIDTH_IN = 6.5
+"""Text width of a page; fonts are sized for it."""
+DPI = 130
+INK, GREY, SWITCH = "#222222", "#8a8a8a", "#c1272d"
+GREEN = "#009E73"
+OTHERS = ("#000000", "#7a5195", "#8c564b", "#6b8e23", "#44aa99", "#4d4d9a")
+"""Colours of experiments without one of their own, by the order of their names."""
+EXPERIMENTS = {
+    "plus-normm": "#D55E00",
+    "plus-normm-fit": "#CC79A7",
+    "plus-rmm": "#0072B2",
+    "plus-rmm-nopretrain": "#56B4E9",
+    "plus-minus": "#882255",
+    "i16c": "#E69F00",
+}
+ACTIONS = ("forward", "left", "right")
+ACTION_COLOURS = {"forward": "#0072B2", "left": "#E69F00", "right": "#009E73"}
+WORLD_COLOURS = {"plus": "#0072B2", "minus": "#D55E00", "i16c": "#009E73"}
+_RC = {
+    "font.size": 8.5,
+    "axes.titlesize": 9.0,
+    "axes.labelsize": 8.5,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "legend.fontsize": 8.0,
+    "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": INK,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e3e3e3",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.4,
+    "savefig.dpi": DPI,
+}
+
+
+def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """A drawing function in our style, whatever matplotlib is set to elsewhere."""
+
+    @wraps(draw)
+    def inner(*args: P.args, **kwargs: P.kwargs) -> Figure:
+        with rc_context(_RC):  # type: ignore[arg-type]
+            return draw(*args, **kwargs)
+
+    return inner
+
+
+def sheet(height_in: float) -> Figure:
+    """An empty figure of page width; what is put on it arranges itself."""
+    return Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+
+
+def png(figure: Figure) -> bytes:
+    """The picture as PNG of at most 256 colours, half as large; equal figures give equal bytes."""
+    drawn, file = io.BytesIO(), io.BytesIO()
+    with rc_context(_RC):  # type: ignore[arg-type]
+        figure.savefig(drawn, format="png")
+    with Image.open(drawn) as picture:
+        fewer = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)
+    fewer.save(file, format="png", optimize=True)
+    return file.getvalue()
+
+
+def colours(names: Iterable[str]) -> dict[str, str]:
+    """One colour per experiment; they repeat where `told_apart` says no."""
+    rest = sorted(set(names) - set(EXPERIMENTS))
+    return EXPERIMENTS | {name: OTHERS[i % len(OTHERS)] for i, name in enumerate(rest)}
+
+
+def told_apart(names: Iterable[str]) -> bool:
+    """Whether there are colours enough for these experiments in one figure."""
+    return len(set(names) - set(EXPERIMENTS)) <= len(OTHERS)
+
+
+def world_colour(name: str) -> str:
+    """Colour of a corridor."""
+    return WORLD_COLOURS.get(name, INK)
+
+
+def draw_band(axes: Axes, band: Band, colour: str, label: str) -> None:
+    """Median as a line, lowest to highest seed as an area."""
+    marker = "o" if len(band.x) < 3 else ""
+    axes.plot(band.x, band.median, color=colour, label=label, marker=marker, markersize=3)
+    if band.seeds > 1:
+        axes.fill_between(band.x, band.low, band.high, color=colour, alpha=0.2, linewidth=0)
+
+
+def draw_stages(axes: Axes, stages: tuple[Stage, ...]) -> None:
+    """Dashed lines between stages, red where the corridor changes, and their numbers on top."""
+    for before, after in pairwise(stages):
+        colour = GREY if before.world == after.world else SWITCH
+        place = after.first_episode - 0.5
+        axes.axvline(place, color=colour, linestyle="--", linewidth=1.0, zorder=1)
+    if len(stages) > 1:
+        top = axes.secondary_xaxis("top")
+        middles = [(stage.first_episode + stage.last_episode) / 2 for stage in stages]
+        top.set_xticks(middles, [str(i + 1) for i in range(len(stages))])
+        top.tick_params(length=0, colors=GREY, pad=1)
+        top.spines["top"].set_visible(False)
+
+
+def stages_text(stages: tuple[Stage, ...]) -> str:
+    """What the numbers on top mean."""
+    if len(stages) < 2:
+        return ""
+    told = (
+        f"{i} {stage.name} ({stage.world}, {stage.first_episode} to {stage.last_episode})"
+        for i, stage in enumerate(stages, start=1)
+    )
+    return f"Stages, with their episodes: {'; '.join(told)}."
+
+
+def legend_below(axes: Axes, columns: int) -> None:
+    """The legend between axis and page, where it hides nothing."""
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=columns)

@@ -1,0 +1,253 @@
+"""Single numbers of runs, how they are written, and comparisons of seeds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from experiments.report.figures.drives import Compared, laps
+from experiments.report.figures.progress import curve_of
+from experiments.report.run_folder import Experiment, Floats, Rows, Run, RunInfo
+from experiments.report.statistics import bootstrap_difference
+from shared.rl.draws import generator
+
+MISSING = float("nan")
+BOOTSTRAP_SEED = 0
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A number of a run that the thesis tells as well."""
+
+    text: str
+    of: Callable[[Run], float]
+    scales: Literal["", "episodes", "memory"] = ""
+    """What it grows with: the number of episodes, or the size of the memory."""
+
+    def scaled(self, value: float, info: RunInfo) -> float:
+        """A number of the thesis at the scale of a run."""
+        by = {"": 1.0, "episodes": info.factor, "memory": info.memory_factor}
+        return value / by[self.scales]
+
+
+def _highest(run: Run, column: str) -> float:
+    values = run.episodes.numbers(column)
+    return float(np.nanmax(values)) if np.any(~np.isnan(values)) else MISSING
+
+
+def max_mean_fitness(run: Run) -> float:
+    """Highest point of the fitness curve (A38)."""
+    return float(np.max(curve_of(run, "fitness")[1], initial=-math.inf))
+
+
+def longest_run_episode(run: Run) -> float:
+    """Episode in which the longest way without a bump got its full length."""
+    lengths = run.runs_without_bump
+    return float(run.episodes.numbers("episode")[np.argmax(lengths)]) if len(lengths) else MISSING
+
+
+def longest_run(run: Run) -> float:
+    """Most actions without a bump in the run's own episodes."""
+    return float(np.max(run.runs_without_bump)) if len(run.episodes) else MISSING
+
+
+def actions_per_episode(run: Run) -> float:
+    """Mean of all episodes."""
+    return run.actions / len(run.episodes) if len(run.episodes) else MISSING
+
+
+MEASURED = {
+    "episodes": Measure("episodes", lambda run: float(len(run.episodes)), "episodes"),
+    "actions": Measure("actions", lambda run: float(run.actions), "episodes"),
+    "actions_per_episode": Measure("actions per episode", actions_per_episode),
+    "capacity": Measure(
+        "largest capacity of the memory", lambda run: _highest(run, "capacity"), "memory"
+    ),
+    "longest_run": Measure("most actions without a bump", longest_run, "episodes"),
+    "longest_run_episode": Measure(
+        "episode of the longest way without a bump", longest_run_episode, "episodes"
+    ),
+    "fitness": Measure("highest mean fitness", max_mean_fitness),
+    "max_threshold_percent": Measure(
+        "highest threshold (%)", lambda run: _highest(run, "threshold_percent")
+    ),
+}
+"""What stands in `thesis` of run.json under these names is shown beside ours (E37)."""
+
+
+def of_seeds(experiment: Experiment, measure: Callable[[Run], float]) -> Floats:
+    """One number per seed, float64 [seeds], without those that have none."""
+    values = np.array([measure(run) for run in experiment.runs], np.float64)
+    return values[np.isfinite(values)]
+
+
+def newest(run: Run, world: str, driver: str = "network") -> Rows:
+    """The last drive of a driver in a world, one row or none."""
+    return Rows(run.evaluations.where(driver=driver, world=world).rows[-1:])
+
+
+def evaluated(column: str, world: str, driver: str = "network") -> Callable[[Run], float]:
+    """A figure of the newest drive; `laps` counts both directions."""
+
+    def measure(run: Run) -> float:
+        rows = newest(run, world, driver)
+        values = laps(rows) if column == "laps" else rows.numbers(column)
+        return float(values[0]) if len(values) else MISSING
+
+    return measure
+
+
+def compare(
+    experiments: Sequence[Experiment], *, first_only: bool = False
+) -> tuple[list[Compared], list[str]]:
+    """Differences of bumps between pairs that drove in the same world.
+
+    Args:
+        experiments: At least two.
+        first_only: Only pairs with the first of them, in place of all.
+
+    Returns:
+        The differences, and a few words for every pair with fewer than 2 seeds of either.
+    """
+    pairs, refused = [], []
+    for i, ours in enumerate(experiments[:1] if first_only else experiments):
+        for theirs in experiments[i + 1 :]:
+            for world in sorted({*ours.worlds} & {*theirs.worlds}):
+                bumps = evaluated("bumps_per_1000", world)
+                a, b = of_seeds(ours, bumps), of_seeds(theirs, bumps)
+                draw = generator(BOOTSTRAP_SEED, "bootstrap", ours.name, theirs.name, world)
+                if min(len(a), len(b)) < 2:
+                    names = f"{ours.name} and {theirs.name} in {world}"
+                    refused.append(f"{names}: {len(a)} and {len(b)} seeds")
+                    continue
+                difference = bootstrap_difference(a, b, draw)
+                pairs.append(Compared(ours.name, theirs.name, world, (len(a), len(b)), difference))
+    return pairs, refused
+
+
+@dataclass(frozen=True)
+class Equal:
+    """Bumps per 1,000 actions of two networks of one seed after equally many actions of learning.
+
+    Each is the newest frozen drive up to there, which may be some actions older.
+    """
+
+    seed: int
+    actions: int
+    ours: float
+    theirs: float
+
+
+def at_equal_actions(
+    ours: Experiment, theirs: Experiment, named: Mapping[str, Experiment], world: str
+) -> list[Equal]:
+    """Seeds of both, each after as many actions as the one that drove less.
+
+    Args:
+        ours: One experiment.
+        theirs: The other.
+        named: Experiments by name, among them those that the two go on from: their drives and
+            actions come before.
+        world: Where they drove frozen.
+    """
+    found = []
+    rivals = {run.info.seed: run for run in theirs.runs}
+    for run in ours.runs:
+        if (rival := rivals.get(run.info.seed)) is None:
+            continue
+        curves = [_with_before(each, named, world) for each in (run, rival)]
+        if not all(len(actions) for actions, _ in curves):
+            continue
+        end = min(actions[-1] for actions, _ in curves)
+        if any(actions[0] > end for actions, _ in curves):
+            continue
+        a, b = (bumps[np.searchsorted(actions, end, "right") - 1] for actions, bumps in curves)
+        found.append(Equal(run.info.seed, int(end), float(a), float(b)))
+    return found
+
+
+def _with_before(run: Run, named: Mapping[str, Experiment], world: str) -> tuple[Floats, Floats]:
+    """Actions driven while learning, and bumps of frozen drives, predecessors' first."""
+    rows = run.evaluated(world)
+    actions, bumps = rows.numbers("total_actions"), rows.numbers("bumps_per_1000")
+    for before in named[run.info.after].runs if run.info.after in named else ():
+        if before.info.seed == run.info.seed:
+            earlier = _with_before(before, named, world)
+            actions, bumps = np.append(earlier[0], actions), np.append(earlier[1], bumps)
+    return actions, bumps
+
+
+def difference_at_equal_actions(
+    ours: str, theirs: str, world: str, found: Sequence[Equal]
+) -> Compared | None:
+    """The difference over all seeds; None with fewer than two."""
+    if len(found) < 2:
+        return None
+    draw = generator(BOOTSTRAP_SEED, "equal-actions", ours, theirs, world)
+    groups = np.array([(each.ours, each.theirs) for each in found]).T
+    difference = bootstrap_difference(groups[0], groups[1], draw)
+    return Compared(ours, theirs, world, (len(found), len(found)), difference)
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Mean bump-free run in a world before and after learning another one."""
+
+    seed: int
+    before: float
+    after: float
+
+    @property
+    def share(self) -> float:
+        """What is left of it."""
+        return self.after / self.before if self.before else MISSING
+
+
+def kept(run: Run, world: str, start: Run | None) -> Kept | None:
+    """How much of one world is left after the stages in others that a run begins with.
+
+    Args:
+        run: Begins in another world.
+        world: The one it could drive in before.
+        start: The run it goes on from, looked at if `run` did not drive before its first episode.
+
+    Returns:
+        None where one of the two drives is missing.
+    """
+    stages = run.info.stages
+    away = [stage for stage in stages if stage.world != world]
+    if not away or away[-1].last_episode is None or stages[0].world == world:
+        return None
+    first, last = stages[0].first_episode, away[-1].last_episode
+    rows = run.evaluated(world)
+    episodes, means = rows.numbers("episode"), rows.numbers("mean_run")
+    before = means[episodes < first]
+    if not len(before) and start is not None:
+        before = newest(start, world).numbers("mean_run")
+    after = means[(episodes >= first) & (episodes <= last)]
+    if not len(before) or not len(after):
+        return None
+    return Kept(run.info.seed, float(before[-1]), float(after[-1]))
+
+
+def number(value: float) -> str:
+    """Three digits that count, thousands apart; a dash for none."""
+    if not math.isfinite(value):
+        return "-"
+    if abs(value) >= 100 or value == round(value):
+        return f"{value:,.0f}".replace("-", "−")
+    return f"{value:.3g}".replace("-", "−")
+
+
+def spread(values: Floats) -> str:
+    """Median, and lowest to highest of several seeds."""
+    if not len(values):
+        return "-"
+    middle = number(float(np.median(values)))
+    if len(values) == 1:
+        return middle
+    return f"{middle} ({number(float(values.min()))} to {number(float(values.max()))})"

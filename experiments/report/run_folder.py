@@ -1,0 +1,350 @@
+"""Runs of experiments as they lie on disk (`experiments/records.py`), read and checked.
+
+One folder per seed; seeds of one experiment at one scale belong together. Kept folders of
+`docs/results/`, with a gzipped table of episodes, are read alike.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from experiments.drives import routes
+from experiments.drives.routes import Route
+from experiments.records import (
+    EPISODE_COLUMNS,
+    EVALUATION_COLUMNS,
+    MemoryRecord,
+    TourRecord,
+    by_world,
+    read_csv,
+)
+from shared.errors import ConfigError, StateError
+
+Floats = npt.NDArray[np.float64]
+
+LEAST_WINDOW = 10
+"""Episodes that a point of a curve averages at the smallest scale."""
+WINDOW = 100
+"""The same at full scale (A37)."""
+IMAGE = (50, 75)
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(frozen=True)
+
+
+class StageInfo(_Record):
+    """A part of a run with settings of its own; episodes are counted globally."""
+
+    name: str
+    world: str
+    first_episode: int
+    last_episode: int | None = None
+    """None while the stage goes on."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """The same with an end, for figures: the newest episode while it goes on."""
+
+    name: str
+    world: str
+    first_episode: int
+    last_episode: int
+
+
+class RunInfo(_Record):
+    """`run.json`: what was run, where, and how far it got."""
+
+    experiment: str
+    title: str
+    scale: str
+    factor: float = Field(gt=0.0)
+    """How many times fewer episodes than in the thesis; 1 at full scale."""
+    memory_factor: float = Field(default=1.0, gt=0.0)
+    """How many times smaller memories are."""
+    seed: int
+    after: str = ""
+    """The experiment whose end this one began with; empty for none."""
+    command: str
+    commit: str
+    machine: str
+    python: str
+    torch: str
+    started: str
+    finished: str
+    """Empty while the run goes on."""
+    seconds: float
+    actions: int
+    """So far, predecessors included."""
+    train_steps: int
+    """Likewise."""
+    complete: bool
+    prefill: str = ""
+    """Hash of the memory as the first episode began; empty for what keeps no such memory."""
+    first_lap: dict[str, float] = Field(default_factory=dict)
+    """When the frozen network first drove a lap; empty if it has not, or nobody looked."""
+    memory: MemoryRecord | None = None
+    """None for what keeps no such memory."""
+    stages: tuple[StageInfo, ...]
+    thesis: dict[str, Any]
+    """The thesis's numbers for this experiment, by the names of `measures.MEASURED`, or as text."""
+
+
+_TOURS = TypeAdapter(tuple[TourRecord, ...])
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A table read from CSV."""
+
+    rows: tuple[dict[str, str], ...]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def numbers(self, column: str) -> Floats:
+        """A column as float64 [n]; NaN where nothing stands."""
+        return np.array([float(row[column] or "nan") for row in self.rows], np.float64)
+
+    def words(self, column: str) -> list[str]:
+        """A column as text."""
+        return [row[column] for row in self.rows]
+
+    def where(self, **wanted: str) -> Rows:
+        """The rows in which columns have these values."""
+        kept = (r for r in self.rows if all(r[name] == value for name, value in wanted.items()))
+        return Rows(tuple(kept))
+
+
+@dataclass(frozen=True)
+class Probes:
+    """Images of a fixed set, and what one network predicts for them."""
+
+    label: str
+    """Stage and world, or `best` and world."""
+    world: str
+    images: npt.NDArray[np.uint8]
+    """uint8 [n, 50, 75]."""
+    values: Floats
+    """float64 [n, 3]: clipped rewards of forward, forward/left, forward/right."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One seed of an experiment."""
+
+    folder: Path
+    info: RunInfo
+    episodes: Rows
+    evaluations: Rows
+    probes: tuple[Probes, ...]
+    routes: dict[str, Route]
+    """By label."""
+    tours: tuple[TourRecord, ...]
+    """In the order of the starts; empty where the plan has none."""
+
+    @property
+    def window(self) -> int:
+        """Episodes averaged into one point: 100 (A37), fewer at a smaller scale, at least 10."""
+        return max(LEAST_WINDOW, round(WINDOW / self.info.factor))
+
+    @property
+    def actions(self) -> int:
+        """Actions of this run's own episodes; `run.json` and evaluations count predecessors too.
+
+        A baseline records no episodes and has no predecessors: what `run.json` says.
+        """
+        if not len(self.episodes):
+            return self.info.actions
+        return int(np.nansum(self.episodes.numbers("actions")))
+
+    @property
+    def train_steps(self) -> int:
+        """Gradient steps of this run alone: those since its first episode, and that one's."""
+        steps = self.episodes.numbers("train_steps")
+        if not len(steps):
+            return self.info.train_steps
+        return int(steps[-1] - steps[0] + self.episodes.numbers("mini_batches")[0])
+
+    @cached_property
+    def runs_without_bump(self) -> Floats:
+        """Actions without a bump at the end of every episode, over episodes of this run (E10)."""
+        lengths, length = [], 0.0
+        actions, bumps = self.episodes.numbers("actions"), self.episodes.numbers("bump")
+        for driven, bump in zip(actions, bumps, strict=True):
+            length += driven
+            lengths.append(length - bump)
+            length *= 1 - bump
+        return np.array(lengths, np.float64)
+
+    @property
+    def stages(self) -> tuple[Stage, ...]:
+        """The stages so far."""
+        numbers = self.episodes.numbers("episode")
+        newest = int(numbers[-1]) if len(numbers) else 0
+        return tuple(
+            Stage(s.name, s.world, s.first_episode, s.last_episode or max(newest, s.first_episode))
+            for s in self.info.stages
+        )
+
+    @cached_property
+    def samples_by_world(self) -> dict[str, Floats]:
+        """Samples in the memory after every episode, by corridor: float64 [episodes] each."""
+        counts = [by_world(text) for text in self.episodes.words("by_world")]
+        names = sorted({name for count in counts for name in count})
+        return {name: np.array([float(c.get(name, 0)) for c in counts]) for name in names}
+
+    def evaluated(self, world: str) -> Rows:
+        """Drives of the frozen network in a world, oldest first."""
+        return self.evaluations.where(driver="network", world=world)
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """All seeds of one experiment at one scale, in order."""
+
+    runs: tuple[Run, ...]
+
+    @property
+    def first(self) -> RunInfo:
+        """What stands in `run.json` of the lowest seed."""
+        return self.runs[0].info
+
+    @property
+    def name(self) -> str:
+        """Name without the scale."""
+        return self.first.experiment
+
+    @property
+    def scale(self) -> str:
+        """Name of the scale."""
+        return self.first.scale
+
+    @property
+    def full_name(self) -> str:
+        """Name and scale, as the folder is called."""
+        return f"{self.name}-{self.scale}"
+
+    @property
+    def worlds(self) -> list[str]:
+        """Worlds in which frozen networks were driven, sorted."""
+        rows = (row for run in self.runs for row in run.evaluations.rows)
+        return sorted({row["world"] for row in rows if row["driver"] == "network"})
+
+
+def load(folders: Iterable[Path]) -> list[Experiment]:
+    """Read runs from seed folders, folders of experiments, or folders of those.
+
+    Returns:
+        Experiments sorted by scale and name, seeds in order; a folder given twice counts once.
+
+    Raises:
+        ConfigError: A folder holds no run, or two folders the same seed of an experiment.
+        StateError: A file is damaged or not what it should be.
+    """
+    groups: dict[tuple[str, str], dict[int, Run]] = {}
+    for folder in _seed_folders(folders):
+        run = read_run(folder)
+        seeds = groups.setdefault((run.info.scale, run.info.experiment), {})
+        if run.info.seed in seeds:
+            other = seeds[run.info.seed].folder
+            raise ConfigError(f"{folder}: the same experiment and seed as {other}; give only one")
+        seeds[run.info.seed] = run
+    return [
+        Experiment(tuple(run for _, run in sorted(seeds.items())))
+        for _, seeds in sorted(groups.items())
+    ]
+
+
+def _seed_folders(folders: Iterable[Path]) -> list[Path]:
+    found: dict[Path, None] = {}
+    for folder in folders:
+        inside = [folder / "run.json", *folder.glob("*/run.json"), *folder.glob("*/*/run.json")]
+        here = sorted(path.parent.resolve() for path in inside if path.is_file())
+        if not here:
+            raise ConfigError(f"{folder}: expected the folder of a run, with run.json; found none")
+        found.update(dict.fromkeys(here))
+    return list(found)
+
+
+def read_run(folder: Path) -> Run:
+    """Read one seed. Raises StateError naming the file that is not what it should be."""
+    info = read_info(folder / "run.json")
+    kept = folder / "episodes.csv.gz"
+    episodes = kept if kept.exists() else folder / "episodes.csv"
+    return Run(
+        folder,
+        info,
+        _table(episodes, EPISODE_COLUMNS),
+        _table(folder / "evaluations.csv", EVALUATION_COLUMNS),
+        tuple(_probes(path) for path in sorted(folder.glob("probes-*.npz"))),
+        {
+            path.stem.removeprefix("route-"): routes.read(path)
+            for path in sorted(folder.glob("route-*.npz"))
+        },
+        _tours(folder / "tours.json"),
+    )
+
+
+def read_info(path: Path) -> RunInfo:
+    """Read and check `run.json`. Raises StateError."""
+    try:
+        return RunInfo.model_validate_json(path.read_bytes())
+    except (OSError, ValidationError) as error:
+        raise StateError(f"{path}: {_first_line(error)}") from error
+
+
+def _tours(path: Path) -> tuple[TourRecord, ...]:
+    if not path.exists():
+        return ()
+    try:
+        return _TOURS.validate_json(path.read_bytes())
+    except (OSError, ValidationError) as error:
+        raise StateError(f"{path}: {_first_line(error)}") from error
+
+
+def _first_line(error: Exception) -> str:
+    if isinstance(error, ValidationError):
+        first = error.errors()[0]
+        return f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}"
+    return str(error)
+
+
+def _table(path: Path, columns: tuple[str, ...]) -> Rows:
+    try:
+        return Rows(tuple(read_csv(path, columns)))
+    except (ValueError, EOFError, OSError) as error:
+        raise StateError(f"{path}: {error}") from error
+
+
+def _arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise StateError(f"{path}: {error}") from error
+
+
+def _probes(path: Path) -> Probes:
+    arrays = _arrays(path)
+    try:
+        images, values = arrays["images"], arrays["values"]
+        world = str(arrays["world"])
+    except KeyError as error:
+        raise StateError(f"{path}: expected an array {error}, found none") from error
+    if images.shape[1:] != IMAGE or images.dtype != np.uint8:
+        raise StateError(f"{path}: expected images uint8 [n, 50, 75], got {images.shape}")
+    if values.shape != (len(images), 3):
+        raise StateError(f"{path}: expected values [{len(images)}, 3], got {values.shape}")
+    label = path.stem.removeprefix("probes-")
+    return Probes(label, world, images, values.astype(np.float64))

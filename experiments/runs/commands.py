@@ -1,0 +1,41 @@
+"""What `corridor experiment` does: checks its options and runs plans."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import get_args
+
+from rich.console import Console
+
+from experiments.runs.schedule import OUT, run_experiment
+from experiments.plans.plan import SCALES, Scale, load_plan, plan_names
+from shared.errors import ConfigError
+
+
+def listing() -> str:
+    """All plans with what they are, one a line."""
+    plans = [load_plan(name, "full") for name in plan_names()]
+    width = max(len(plan.name) for plan in plans)
+    return "\n".join(
+        f"{plan.name:{width}}  {plan.title} ({plan.source})"
+        + (f"; after {plan.after}" if plan.after else "")
+        for plan in plans
+    )
+
+
+def run(
+    names: Sequence[str], scale: str, seeds: int, seed: int | None, jobs: int, out: Path | None
+) -> int:
+    """Run them; returns 0, or 1 when stopped before the end. Raises ConfigError, CorridorError."""
+    chosen = [each for each in get_args(Scale) if each == scale]
+    if not chosen:
+        raise ConfigError(f"--scale: expected one of {', '.join(SCALES)}, got {scale!r}")
+    wanted = seeds if seed is None else [seed]
+    for name in names:
+        available = load_plan(name, chosen[0]).seeds
+        if isinstance(wanted, int) and wanted > len(available):
+            raise ConfigError(f"--seeds: {name} has {len(available)} seeds, got {wanted}")
+    folder = out or OUT
+    done = run_experiment(names, chosen[0], wanted, folder, jobs, Console())
+    return 0 if done else 1

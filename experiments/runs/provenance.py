@@ -1,0 +1,65 @@
+"""What figures were made with and on: commit, processor, versions."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import shutil
+import subprocess
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+if TYPE_CHECKING:
+    from shared.config import Config
+
+ROOT = Path(__file__).parents[2]
+RECORDED = (":!docs", ":!benchmarks/results.json", ":!benchmarks/results.md")
+"""Text, and what measuring writes: no change to what is measured."""
+
+
+def machine() -> dict[str, str]:
+    """What figures were measured on."""
+    return {
+        "cpu": _processor(),
+        "cores": str(len(os.sched_getaffinity(0))),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "commit": commit(),
+    }
+
+
+def machine_key(config: Config) -> str:
+    """8 hex digits over what decides which arithmetic is the fastest one."""
+    decides = {
+        "machine": [_processor(), len(os.sched_getaffinity(0)), torch.__version__],
+        "network": config.network.model_dump(mode="json"),
+        "numerics": config.numerics.model_dump(mode="json"),
+        "learning": [config.learning.batch_size, config.learning.mode],
+    }
+    return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:8]
+
+
+def commit() -> str:
+    """The commit measured, with a plus when tracked files differ from it."""
+    git = shutil.which("git")
+    if git is None or not (ROOT / ".git").exists():
+        return "unknown"
+
+    def said(*words: str) -> str:
+        done = subprocess.run([git, *words], cwd=ROOT, capture_output=True, text=True, check=False)
+        return done.stdout.strip()
+
+    changed = said("status", "--porcelain", "--untracked-files=no", "--", ".", *RECORDED)
+    return said("rev-parse", "--short", "HEAD") + ("+" if changed else "")
+
+
+def _processor() -> str:
+    info = Path("/proc/cpuinfo")
+    for line in info.read_text().splitlines() if info.exists() else ():
+        if line.startswith("model name"):
+            return line.split(":")[1].strip()
+    return platform.processor() or platform.machine()

@@ -1,0 +1,221 @@
+"""Many runs of a plan: seeds side by side, predecessors first, progress in the terminal.
+
+`corridor experiment NAME --scale mini --seeds 3` runs a plan with its first three seeds, two at a
+time on two cores. Run again, it goes on where it was stopped; finished runs are left alone.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import queue
+import signal
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bars
+
+from experiments.plans.plan import Plan, Scale, load_plan
+from experiments.runs.run import Progress, Run
+from shared.errors import CorridorError
+
+OUT = Path("runs") / "experiments"
+"""Default folder of all experiments."""
+POLL_S = 0.5
+STOPS = (signal.SIGINT, signal.SIGTERM)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run to be done."""
+
+    plan: str
+    scale: Scale
+    seed: int
+    out: Path
+
+    @property
+    def folder(self) -> Path:
+        """Where it lies."""
+        return self.out / f"{self.plan}-{self.scale}" / f"seed-{self.seed}"
+
+    @property
+    def name(self) -> str:
+        """Of its bar."""
+        return f"{self.plan} {self.seed}"
+
+
+def chain(name: str, scale: Scale) -> list[Plan]:
+    """A plan and those it goes on from, the first one first (A46). Raises ConfigError."""
+    plan = load_plan(name, scale)
+    return [*chain(plan.after, scale), plan] if plan.after else [plan]
+
+
+def run_experiment(
+    names: Sequence[str],
+    scale: Scale,
+    seeds: Sequence[int] | int,
+    out: Path,
+    jobs: int,
+    console: Console,
+) -> bool:
+    """Run plans with some seeds, predecessors included; whether all came to their end.
+
+    Args:
+        names: Of plans.
+        scale: `full` or `mini`.
+        seeds: These, or how many of each plan's own, from the first.
+        out: Folder for all runs.
+        jobs: Runs side by side; they divide the cores among them.
+        console: Where progress is shown.
+
+    Raises:
+        ConfigError: No plan of that name, or one that cannot be run.
+        CorridorError: A run failed; the others were stopped after their current turn.
+    """
+    chains = [chain(name, scale) for name in names]
+    wanted = [
+        [Job(plan.name, scale, seed, out) for plan in plans]
+        for plans in chains
+        for seed in (plans[-1].seeds[:seeds] if isinstance(seeds, int) else seeds)
+    ]
+    context = multiprocessing.get_context("spawn")
+    reports: Any = context.Queue()
+    stop: Any = context.Event()
+    shares: Any = context.Queue()
+    for share in shares_of(sorted(os.sched_getaffinity(0)), jobs):
+        shares.put(share)
+    for number in STOPS:  # also where the shell had SIGINT ignored, as it does in the background
+        signal.signal(number, signal.default_int_handler)
+    with (
+        ProcessPoolExecutor(jobs, context, _begin, (reports, stop, shares)) as pool,
+        _bars(console) as bars,
+    ):
+        # A chain of one seed is one piece of work; equal jobs of two chains are done only once.
+        futures = [pool.submit(_work, jobs_of_seed) for jobs_of_seed in _distinct(wanted)]
+        try:
+            _watch(futures, reports, bars)
+        except KeyboardInterrupt:
+            console.print("stopping after the current turns; the same command goes on")
+            stop.set()
+        return _results(futures, stop)
+
+
+def shares_of(cores: Sequence[int], jobs: int) -> list[set[int]]:
+    """Cores of each of the runs side by side: different ones as far as there are enough."""
+    return [set(cores[job % len(cores) :: jobs]) for job in range(jobs)]
+
+
+def _distinct(chains: list[list[Job]]) -> list[list[Job]]:
+    """Chains that share jobs joined into one piece of work, each job once, in order."""
+    pieces: list[list[Job]] = []
+    for jobs in chains:
+        common = next((piece for piece in pieces if set(piece) & set(jobs)), None)
+        if common is None:
+            pieces.append(list(jobs))
+        else:
+            common.extend(job for job in jobs if job not in common)
+    return pieces
+
+
+def _results(futures: list[Future[bool]], stop: Any) -> bool:
+    """Whether all are complete; the first failure stops the others and is raised."""
+    complete = True
+    for future in futures:
+        try:
+            complete &= future.result()
+        except BaseException:
+            stop.set()
+            raise
+    return complete
+
+
+def _bars(console: Console) -> Bars:
+    return Bars(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("episodes, {task.fields[text]}"),
+        TimeRemainingColumn(),
+        console=console,
+    )
+
+
+def _watch(futures: list[Future[bool]], reports: Any, bars: Bars) -> None:
+    """Show what the runs report until all are done or one failed."""
+    tasks: dict[str, Any] = {}
+    while True:
+        try:
+            progress: Progress = reports.get(timeout=POLL_S)
+        except queue.Empty:
+            if all(future.done() for future in futures) or _failed(futures):
+                return
+            continue
+        if progress.run not in tasks:
+            tasks[progress.run] = bars.add_task(progress.run, total=progress.episodes, text="")
+        text = f"{progress.actions} actions, fitness {progress.fitness:.0f}"
+        bars.update(tasks[progress.run], completed=progress.episode, text=text)
+
+
+def _failed(futures: list[Future[bool]]) -> bool:
+    return any(future.done() and future.exception() is not None for future in futures)
+
+
+# ---------------------------------------------------------------- in the worker processes
+
+_reports: Any = None
+_stop: Any = None
+
+
+def _begin(reports: Any, stop: Any, shares: Any) -> None:
+    """Prepare a worker: stopping is the main process's business, and the cores are divided.
+
+    A plan may leave the number of threads to the cores there are: on the same ones, runs would slow
+    each other down.
+    """
+    global _reports, _stop
+    for number in STOPS:
+        signal.signal(number, signal.SIG_IGN)
+    os.sched_setaffinity(0, shares.get())
+    _reports, _stop = reports, stop
+    _end_with_parent()
+
+
+def _end_with_parent() -> None:
+    """A worker whose main process was killed must not go on for hours."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def _work(jobs: Sequence[Job]) -> bool:
+    """Run jobs one after the other; whether all came to their end."""
+    return all(do(job, _reports.put, _stop.is_set) for job in jobs)
+
+
+def do(job: Job, report: Callable[[Progress], None], stopped: Callable[[], bool]) -> bool:
+    """One job; whether it is complete. Raises CorridorError."""
+    if stopped():
+        return False
+    plan = load_plan(job.plan, job.scale)
+    before = Job(plan.after, job.scale, job.seed, job.out).folder if plan.after else None
+    command = f"corridor experiment {job.plan} --scale {job.scale} --seed {job.seed}"
+    try:
+        run = Run(plan, job.scale, job.seed, job.folder, before, command)
+    except CorridorError as error:
+        raise type(error)(f"{job.name}: {error}") from error
+    try:
+        return run.go(report, stopped)
+    finally:
+        run.close()

@@ -1,0 +1,154 @@
+"""The commands about simulated worlds: `corridor world ...` and `corridor obstacle ...`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from services.cli.options import (
+    EXIT_CRASH,
+    AtEpisode,
+    ConfigFile,
+    Endpoint,
+    Preset,
+    Robot,
+    Run,
+    RunDir,
+    Set,
+    import_role,
+    load,
+    reach,
+)
+
+WorldName = Annotated[
+    str, typer.Argument(help="Name of the world, such as plus, or path of a world file.")
+]
+world = typer.Typer(
+    help="Look at simulated worlds, and let robots drive in another.", no_args_is_help=True
+)
+obstacle = typer.Typer(help="Place and remove boxes where robots drive.", no_args_is_help=True)
+
+
+@world.command("list")
+def world_list() -> None:
+    """List the worlds that come along and those in the folder worlds/."""
+    worlds = import_role("services.robot_driver.simulated.world", "driver")
+    for name, path in worlds.world_files().items():
+        loaded = worlds.read_world(path)
+        x0, y0, x1, y1 = loaded.bounds
+        laps = "laps" if loaded.lap else "no laps"
+        size = f"{x1 - x0:.1f} x {y1 - y0:.1f} m"
+        typer.echo(f"{name:16} {size:14} {laps:8} {path}  {loaded.title}")
+
+
+@world.command("render")
+def world_render(
+    name: WorldName,
+    out: Annotated[Path, typer.Option(help="Folder for the PNG files.")] = Path("renders"),
+) -> None:
+    """Write a top view and camera views of a world as PNG files."""
+    views = import_role("services.robot_driver.atlas.views", "driver")
+    views.render(name, out)
+    typer.echo(f"written to {out}")
+
+
+@world.command("check")
+def world_check(
+    name: WorldName,
+    preset: Preset = None,
+    config: ConfigFile = None,
+    set_: Set = None,
+) -> None:
+    """Print what is wrong with a world (exit code 1), or measure it: how hard it is, laps, tour."""
+    worlds = import_role("services.robot_driver.simulated.world", "driver")
+    survey = import_role("services.robot_driver.atlas.survey", "driver")
+    path = worlds.world_path(name)
+    loaded = load(preset, config, set_, others={"robot.world": path.stem})
+    problems = survey.problems_in(path, loaded)
+    for line in problems:
+        typer.echo(line)
+    if problems:
+        raise typer.Exit(EXIT_CRASH)
+    for key, value in survey.survey(loaded, worlds.read_world(path)).items():
+        typer.echo(f"{key:40} {value:.3f}" if isinstance(value, float) else f"{key:40} {value}")
+
+
+# ---------------------------------------------------------------- while it runs
+
+
+@world.command("switch")
+def world_switch(
+    name: Annotated[str, typer.Argument(help="World to drive in, such as minus.")],
+    start: Annotated[int, typer.Option(min=0, help="Which of its start poses.")] = 0,
+    at_episode: AtEpisode = 0,
+    run: Run = None,
+    run_dir: RunDir = None,
+    endpoint: Endpoint = None,
+    robot: Robot = None,
+) -> None:
+    """Let robots of a running simulation go on in another world.
+
+    Samples that look ahead across the change are dropped and counted.
+    """
+    change = {"kind": "switch", "world": name, "start": start, "at_episode": at_episode}
+    raise typer.Exit(_change_world(run, run_dir, endpoint, robot, change))
+
+
+@obstacle.command("place")
+def obstacle_place(
+    name: Annotated[str, typer.Argument(help="Name of the box, to remove it by.")],
+    x: Annotated[float, typer.Option(help="Of its middle, m.")],
+    y: Annotated[float, typer.Option(help="Of its middle, m.")],
+    heading_deg: Annotated[float, typer.Option(help="Direction of its length.")] = 0.0,
+    length: Annotated[float, typer.Option(help="m.")] = 0.5,
+    width: Annotated[float, typer.Option(help="m.")] = 0.5,
+    height: Annotated[float, typer.Option(help="m.")] = 0.5,
+    rgb: Annotated[tuple[int, int, int], typer.Option(help="Colour, 0..255 each.")] = (200, 60, 40),
+    at_episode: AtEpisode = 0,
+    run: Run = None,
+    run_dir: RunDir = None,
+    endpoint: Endpoint = None,
+    robot: Robot = None,
+) -> None:
+    """Let a box stand in the world of a running simulation: solid, and seen."""
+    box = {
+        "name": name,
+        "x_m": x,
+        "y_m": y,
+        "heading_deg": heading_deg,
+        "length_m": length,
+        "width_m": width,
+        "height_m": height,
+        "rgb": rgb,
+    }
+    change = {"kind": "place", "box": box, "at_episode": at_episode}
+    raise typer.Exit(_change_world(run, run_dir, endpoint, robot, change))
+
+
+@obstacle.command("remove")
+def obstacle_remove(
+    name: Annotated[str, typer.Argument(help="Name of the box.")],
+    at_episode: AtEpisode = 0,
+    run: Run = None,
+    run_dir: RunDir = None,
+    endpoint: Endpoint = None,
+    robot: Robot = None,
+) -> None:
+    """Take a box away again, one that was placed or one that belongs to the world."""
+    change = {"kind": "remove", "name": name, "at_episode": at_episode}
+    raise typer.Exit(_change_world(run, run_dir, endpoint, robot, change))
+
+
+def _change_world(
+    run: str | None,
+    run_dir: Path | None,
+    endpoint: str | None,
+    robot: str | None,
+    change: dict[str, Any],
+) -> int:
+    """Wish for a change of the world of a run's robots; returns the exit code."""
+    from services.monitor.operator import change_world
+
+    return change_world(reach(run, run_dir, endpoint), robot, **change)

@@ -1,0 +1,1 @@
+"""Driving without learning: a frozen network or a person commands one robot."""

@@ -1,0 +1,170 @@
+"""`corridor drive`: a frozen network drives a robot: no learning, no memory, the image only (A45).
+
+It acts greedily and turns on the spot where it predicts nothing good (`shared.rl.spot_turns`).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from services.commander import frozen
+from services.commander.commander import Commander, commanding
+from shared.config import Config, NetworkConfig
+from shared.messages import Motion, Observation, image_array
+from shared.rl.draws import generator
+from shared.rl.policy import choose_greedily
+from shared.rl.predictor import Predictor
+from shared.rl.spot_turns import Side, SpotTurns
+from shared.service import TICK_S
+
+ROLE = "drive"
+TELL_EVERY_S = 2.0
+NAMES = ("forward", "forward/left", "forward/right")
+SILENT_S = 10.0
+"""A robot that has said nothing for so long is mentioned."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What the network wants for one image."""
+
+    action: int
+    side: Side
+    """Turn on the spot to this side instead; empty: drive."""
+    values: tuple[float, float, float]
+
+    def __str__(self) -> str:
+        what = f"turn {self.side}" if self.side else NAMES[self.action]
+        return f"{what:13} predicted " + " ".join(f"{value:+.2f}" for value in self.values)
+
+
+class Mind:
+    """The frozen network and the turn it is in, if any.
+
+    Args:
+        network: Predicts; never changes.
+        config: Seed (of draws between equal predictions), turn rate and period.
+        robot: Id of the robot.
+    """
+
+    def __init__(self, network: Predictor, config: Config, robot: str) -> None:
+        self._network = network
+        self._turns = SpotTurns(config.robot.turn_rad_s * config.robot.period_s)
+        self._draw = generator(config.run.seed, ROLE, robot)
+
+    def choose(self, observation: Observation) -> Choice:
+        """What to do about an observation."""
+        values = self._network.all_values(image_array(observation.image)[np.newaxis])[0]
+        action = choose_greedily(values, self._draw)
+        side = self._turns.decide(values, action)
+        return Choice(action, side, (float(values[0]), float(values[1]), float(values[2])))
+
+
+@dataclass
+class Log:
+    """What the robot did so far, from its observations and what was asked of it."""
+
+    actions: int = 0
+    turns: int = 0
+    bumps: int = 0
+    way_m: float = 0.0
+    _before: Observation | None = None
+    _asked: bool = False
+
+    def see(self, observation: Observation) -> None:
+        """An observation that waits for an answer."""
+        before, self._before = self._before, observation
+        moved = self._asked and observation.interruption in ("", "moved")
+        self._asked = False
+        if before is None or (before.life, before.world) != (observation.life, observation.world):
+            return
+        if moved and observation.bump:
+            self.bumps += 1
+        if observation.sequence > before.sequence:
+            self.actions += observation.sequence - before.sequence
+        elif moved and observation.interruption == "moved":
+            self.turns += 1
+        self.way_m += math.hypot(observation.x_m - before.x_m, observation.y_m - before.y_m)
+
+    def ask(self) -> None:
+        """The observation was answered with an action or a turn."""
+        self._asked = True
+
+    def __str__(self) -> str:
+        return (
+            f"{self.actions} actions, {self.turns} turns on the spot, {self.bumps} bumps, "
+            f"{self.way_m:.1f} m"
+        )
+
+
+def run(
+    config: Config,
+    network: NetworkConfig,
+    weights: Path,
+    robot: str | None,
+    actions: int,
+    echo: Callable[[str], None],
+) -> int:
+    """Drive until stopped, or until so many actions are done.
+
+    Args:
+        config: How to reach the run, and its robot.
+        network: Shape of the network.
+        weights: Folder of a run, or a file of weights.
+        robot: Which robot; None: the only one there is.
+        actions: 0: until stopped.
+        echo: Shows a line.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        ConfigError: No such weights, another shape of network, or another robot than there is.
+        StateError: The weights are damaged.
+        PeerMissing, RobotTaken or RouterMissing: See `commanding`.
+    """
+    found = frozen.read(frozen.find(weights))
+    predictor = found.predictor(network)
+    with commanding(config, robot) as commander:
+        echo(f"{commander.robot}: driven by {found.path}; Ctrl-C stops it")
+        mind, log = Mind(predictor, config, commander.robot), Log()
+        try:
+            _drive(commander, mind, log, actions, echo)
+        finally:
+            echo(f"{commander.robot}: {log}")
+    return 0
+
+
+def _drive(
+    commander: Commander, mind: Mind, log: Log, actions: int, echo: Callable[[str], None]
+) -> None:
+    now_s = time.monotonic()
+    tell_s, silent_s = now_s, now_s + SILENT_S
+    while not commander.stop.is_set() and not (actions and log.actions >= actions):
+        observation = commander.observe(TICK_S)
+        now_s = time.monotonic()
+        if observation is None:
+            if now_s >= silent_s:
+                silent_s = now_s + SILENT_S
+                echo(f"{commander.robot}: nothing heard for {SILENT_S:.0f} s (stopped, paused?)")
+            continue
+        silent_s = now_s + SILENT_S
+        log.see(observation)
+        if actions and log.actions >= actions:
+            return
+        choice = mind.choose(observation)
+        if choice.side:
+            turn: Motion = "turn-left" if choice.side == "left" else "turn-right"
+            commander.answer(observation, motion=turn, values=choice.values)
+        else:
+            commander.answer(observation, action=choice.action, values=choice.values)
+        log.ask()
+        if now_s >= tell_s:
+            tell_s = now_s + TELL_EVERY_S
+            echo(f"{choice}  {log}")

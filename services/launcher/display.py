@@ -1,0 +1,63 @@
+"""Where the live view goes: a table in a terminal, a line every few seconds anywhere else."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Protocol, TextIO
+
+from rich.console import Console
+from rich.live import Live
+
+from services.launcher.live import View, line, panel, warnings
+
+LINE_EVERY_S = 5.0
+"""Period of the plain lines; a change of the warnings shows at once."""
+
+
+class Display(Protocol):
+    """Shows views."""
+
+    def show(self, view: View) -> None:
+        """Show the newest view."""
+
+
+class Table:
+    """A table that is redrawn in place."""
+
+    def __init__(self, live: Live) -> None:
+        self._live = live
+
+    def show(self, view: View) -> None:
+        """Redraw the table."""
+        self._live.update(panel(view), refresh=True)
+
+
+class Lines:
+    """One line now and then."""
+
+    def __init__(self, output: TextIO, clock: Callable[[], float] = time.monotonic) -> None:
+        self._output, self._clock = output, clock
+        self._next_s = 0.0
+        self._shown: tuple[int, str] = (0, "")
+
+    def show(self, view: View) -> None:
+        """Write a line if it is time, or if something else is wrong than before."""
+        state = (len(warnings(view)), view.note)
+        if self._clock() < self._next_s and state == self._shown:
+            return
+        self._next_s, self._shown = self._clock() + LINE_EVERY_S, state
+        self._output.write(line(view) + "\n")
+        self._output.flush()
+
+
+@contextmanager
+def display_for(output: TextIO) -> Iterator[Display]:
+    """The display that suits an output."""
+    console = Console(file=output)
+    if not console.is_terminal:
+        yield Lines(output)
+        return
+    with Live(console=console, auto_refresh=False) as live:
+        yield Table(live)

@@ -1,0 +1,215 @@
+"""What a person sees while a run is up: pure functions from a view to text or a live table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from rich.console import Group, RenderableType
+from rich.panel import Panel
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from services.launcher.supervisor import ChildStatus
+from services.monitor.heartbeats import Seen, Snapshot
+from services.monitor.words import (
+    by_action,
+    duration,
+    fill_share,
+    fit_share,
+    fitness,
+    learner_doing,
+    replay_doing,
+    threshold,
+)
+from shared.messages import ActorState, LearnerState, Message, ReplayState, RobotState
+
+BAR_WIDTH = 30
+RECENT_S = 60.0
+"""A crash longer ago is mentioned, but no longer explained."""
+
+
+@dataclass(frozen=True)
+class View:
+    """Everything the display shows."""
+
+    run: str
+    endpoint: str
+    uptime_s: float
+    snapshot: Snapshot
+    children: Sequence[ChildStatus] = ()
+    episodes_wanted: int = 0
+    """0: no end in sight."""
+    heartbeat_s: float = 1.0
+    note: str = ""
+    """Such as "stopping"."""
+
+
+# ---------------------------------------------------------------- words
+
+
+def episodes(view: View) -> str:
+    """Episodes stored, and how many are wanted."""
+    replay = view.snapshot.replay
+    count = str(replay.message.episode) if replay else "-"
+    return f"{count} of {view.episodes_wanted}" if view.episodes_wanted else count
+
+
+def warnings(view: View) -> list[str]:
+    """What is not as it should be, most urgent first."""
+    return [*_robot_warnings(view), *_child_warnings(view), *_silences(view), *_losses(view)]
+
+
+def _robot_warnings(view: View) -> Iterator[str]:
+    for name, seen in view.snapshot.robots.items():
+        if seen.message.state == "estop":
+            yield f"robot {name}: emergency stop, release it by `corridor clear`"
+        elif seen.message.state == "paused":
+            yield f"robot {name}: paused, let it go on by `corridor resume`"
+        if seen.message.reason:
+            yield f"robot {name}: stands still: {seen.message.reason}"
+
+
+def _child_warnings(view: View) -> Iterator[str]:
+    for child in view.children:
+        if child.state == "restarting":
+            yield f"{child.name} is being restarted after {child.note}"
+        elif child.state == "stopped":
+            yield f"{child.name} has stopped"
+        elif child.restarts:
+            times = "once" if child.restarts == 1 else f"{child.restarts} times"
+            why = f", last after {child.note}" if child.up_s < RECENT_S else ""
+            yield f"{child.name} was restarted {times}{why}"
+
+
+def _silences(view: View) -> Iterator[str]:
+    snapshot = view.snapshot
+    heartbeats: dict[str, Seen[Message] | None] = {
+        "replay": snapshot.replay,
+        "learner": snapshot.learner,
+        **{f"robot {name}": seen for name, seen in snapshot.robots.items()},
+        **{f"actor of {name}": seen for name, seen in snapshot.actors.items()},
+    }
+    for name, seen in heartbeats.items():
+        if seen is not None and seen.age_s > 3 * view.heartbeat_s:
+            yield f"{name}: silent for {seen.age_s:.0f} s"
+
+
+def _losses(view: View) -> Iterator[str]:
+    snapshot = view.snapshot
+    undecodable = sum(
+        seen.message.undecodable
+        for seen in (
+            *snapshot.robots.values(),
+            *snapshot.actors.values(),
+            *((snapshot.replay,) if snapshot.replay else ()),
+            *((snapshot.learner,) if snapshot.learner else ()),
+        )
+    )
+    if undecodable:
+        yield f"{undecodable} messages could not be decoded"
+    if snapshot.replay and snapshot.replay.message.refused:
+        yield f"{snapshot.replay.message.refused} episodes were refused"
+
+
+# ---------------------------------------------------------------- one line
+
+
+def line(view: View) -> str:
+    """Everything in one line, for logs and pipes."""
+    snapshot = view.snapshot
+    parts = [duration(view.uptime_s)]
+    if snapshot.replay is None and snapshot.learner is None:
+        parts.append("services are starting")
+    if snapshot.replay is not None:
+        replay = snapshot.replay.message
+        parts += [
+            f"episode {episodes(view)}",
+            f"fitness {fitness(replay)}",
+            f"bumps {replay.bumps}",
+            f"laps {replay.laps_left} left {replay.laps_right} right",
+            f"memory {replay.size}/{replay.capacity} ({by_action(replay.by_action)})",
+            f"threshold {threshold(replay)}",
+        ]
+        if replay.filling:
+            parts.append(replay_doing(replay))
+    if snapshot.actors:
+        parts.append(f"{snapshot.actions_per_s:.1f} steps/s")
+    if snapshot.learner is not None:
+        learner = snapshot.learner.message
+        parts += [f"weights {learner.weights_version}", f"learner {learner_doing(learner)}"]
+    parts += [f"! {text}" for text in warnings(view)]
+    return " | ".join([*parts, *([view.note] if view.note else [])])
+
+
+# ---------------------------------------------------------------- live table
+
+
+def panel(view: View) -> RenderableType:
+    """The whole live view."""
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column()
+    table.add_column()
+    for row in _rows(view):
+        table.add_row(*row)
+    problems = [Text(f"! {text}", style="yellow") for text in warnings(view)]
+    title = f"run {view.run}   {duration(view.uptime_s)}"
+    foot = view.note or "Ctrl-C stops; the same command continues"
+    return Panel(Group(table, *problems), title=title, subtitle=foot, title_align="left")
+
+
+def _rows(view: View) -> Iterator[tuple[RenderableType, ...]]:
+    snapshot = view.snapshot
+    if snapshot.replay is None and snapshot.learner is None:
+        yield "starting", ", ".join(child.name for child in view.children), ""
+    if snapshot.replay is not None:
+        yield from _learning_rows(view, snapshot.replay.message)
+        yield from _memory_rows(snapshot.replay.message)
+    if snapshot.learner is not None:
+        yield from _learner_rows(snapshot.learner.message)
+    for name in sorted({*snapshot.robots, *snapshot.actors}):
+        robot, actor = snapshot.robots.get(name), snapshot.actors.get(name)
+        yield _robot_row(name, robot.message if robot else None, actor.message if actor else None)
+
+
+def _learning_rows(view: View, replay: ReplayState) -> Iterator[tuple[RenderableType, ...]]:
+    yield "episodes", episodes(view), f"fitness {fitness(replay)} (mean of the last 100)"
+    laps = f"laps {replay.laps_left} left, {replay.laps_right} right"
+    yield "bumps", str(replay.bumps), laps
+    rate = f"{view.snapshot.actions_per_s:.1f} per second"
+    yield "steps", str(replay.actions), rate
+
+
+def _memory_rows(replay: ReplayState) -> Iterator[tuple[RenderableType, ...]]:
+    share = fill_share(replay)
+    bar = ProgressBar(total=1.0, completed=share, width=BAR_WIDTH)
+    yield "memory", bar, f"{replay.size} of {replay.capacity}, {replay_doing(replay)}"
+    yield "  by action", by_action(replay.by_action), f"threshold {threshold(replay)}"
+    if any(replay.candidates_by_action):
+        yield "  candidates", by_action(replay.candidates_by_action), ""
+
+
+def _learner_rows(learner: LearnerState) -> Iterator[tuple[RenderableType, ...]]:
+    loss = "" if learner.loss is None else f", loss {learner.loss:.5f}"
+    yield (
+        "network",
+        f"weights version {learner.weights_version}",
+        f"{learner.train_steps} training steps, {learner.fits} fitting phases{loss}",
+    )
+    if learner.activity == "fitting":
+        bar = ProgressBar(total=1.0, completed=fit_share(learner), width=BAR_WIDTH)
+        yield "learner", bar, learner_doing(learner)
+    else:
+        yield "learner", learner_doing(learner), f"episode {learner.episode} done"
+
+
+def _robot_row(
+    name: str, robot: RobotState | None, actor: ActorState | None
+) -> tuple[RenderableType, ...]:
+    state = f"{robot.state} in {robot.world}" if robot else "unknown"
+    if actor is None:
+        return f"robot {name}", state, "no actor yet"
+    values = " ".join(f"{value:+.2f}" for value in actor.values)
+    return f"robot {name}", state, f"actor {actor.phase}, step {actor.step}, Q {values}"

@@ -1,0 +1,1 @@
+"""What is known of a world from its map: planner, survey, inspection, pictures."""

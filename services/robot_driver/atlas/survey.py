@@ -1,0 +1,253 @@
+"""Measures a world and a motion together: what can be driven, and how hard it is (A4, E31).
+
+`corridor world check` prints the result of `problems_in`, or, if there are none, of `survey`.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from services.robot_driver.atlas.inspection import problems
+from services.robot_driver.atlas.planner import TURNS, Motion, Planner
+from services.robot_driver.recovery import back_off
+from services.robot_driver.robot import Pose, Velocity
+from services.robot_driver.simulated.sim import SimRobot
+from services.robot_driver.simulated.world import World, WorldError, read_world
+from shared.config import Config
+
+__all__ = ["RandomDrive", "corridor_width", "drive_randomly", "problems_in", "survey"]
+
+Figures = dict[str, float | int | str | bool]
+
+PLANNED_ACTIONS = 500
+"""A pose counts as saved when a planned run of this many actions exists from it (A9)."""
+COMFORTABLE_M = 0.4
+"""Room to all walls on the lap that stands for an ordinary driving line."""
+_RECOVERIES = 1000
+_RACE_ACTIONS = 600
+_TOUR_HORIZON = 6
+_SPACING_M = 0.1
+"""Distance of the places at which the width is measured."""
+
+
+@dataclass(frozen=True)
+class RandomDrive:
+    """What a robot met that chose actions uniformly at random and recovered after each bump."""
+
+    runs: npt.NDArray[np.int64]
+    """[n]: actions without a bump before each bump."""
+    poses: npt.NDArray[np.float64]
+    """[n, 3]: x, y, heading after each recovery."""
+    retreats_m: npt.NDArray[np.float64]
+    """[n]: way won by each recovery."""
+    physics_s: float
+    """Mean time that simulating one action took, without the camera."""
+
+
+def problems_in(path: Path, config: Config) -> list[str]:
+    """What is wrong with a world file for the configured robot, one line each."""
+    try:
+        world = read_world(path)
+    except WorldError as error:
+        return [str(error)]
+    return problems(world, Motion.of(config.robot))
+
+
+def survey(config: Config, world: World) -> Figures:
+    """Measure the configured robot in a world, about a minute for each hundred square metres.
+
+    Returns:
+        Named figures: lengths in metres, angles in degrees, times in milliseconds.
+
+    """
+    motion = Motion.of(config.robot)
+    robot = SimRobot(config.robot, world, config.run.seed)
+    try:
+        driven = drive_randomly(robot, _RECOVERIES, config.run.seed)
+        pictures = _render_times(robot)
+    finally:
+        robot.close()
+    planner = Planner(world, motion, horizon=PLANNED_ACTIONS)
+    return {
+        "world": world.name,
+        **_geometry(world, motion),
+        **_best_run(planner),
+        **_laps(planner),
+        **_tour(world, motion),
+        **_random_figures(driven),
+        **_saved(planner, driven),
+        **pictures,
+        "physics_ms": driven.physics_s * 1e3,
+    }
+
+
+def drive_randomly(robot: SimRobot, bumps: int, seed: int) -> RandomDrive:
+    """Drive uniformly random actions until so many bumps, each followed by `back_off` (E9, E11)."""
+    config = robot.config
+    draw = np.random.default_rng(seed)
+    turns = [turn * config.turn_rad_s for turn in TURNS]
+    runs: list[int] = []
+    poses: list[tuple[float, float, float]] = []
+    retreats: list[float] = []
+    actions = done = 0
+    spent = 0.0
+    while len(runs) < bumps:
+        robot.drive(Velocity(config.speed_m_s, 0.0, turns[int(draw.integers(3))]))
+        began = time.perf_counter()
+        bumped = robot.run(config.period_s, stop_on_contact=True)
+        spent += time.perf_counter() - began
+        actions, done = actions + 1, done + 1
+        if bumped:
+            runs.append(actions - 1)
+            actions = 0
+            retreats.append(back_off(robot, config, float(draw.uniform(-math.pi, math.pi))))
+            poses.append((robot.pose.x_m, robot.pose.y_m, robot.pose.heading_rad))
+    return RandomDrive(np.array(runs), np.array(poses), np.array(retreats), spent / done)
+
+
+def corridor_width(world: World) -> float:
+    """Smallest distance straight across from any wall to what stands opposite it."""
+    return min(float(_widths(world, segment).min()) for segment in world.segments)
+
+
+def _widths(world: World, segment: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Distances straight across from places on one wall segment; inf where an obstacle stands."""
+    ax, ay, bx, by = segment
+    along = np.array([bx - ax, by - ay])
+    length = float(np.hypot(*along))
+    part = (np.arange(max(1, round(length / _SPACING_M))) + 0.5) * _SPACING_M / length
+    points = (ax, ay) + np.minimum(part, 0.5 if len(part) == 1 else 1.0)[:, None] * along
+    across = np.array([-along[1], along[0]]) / length
+    far = world.sight(points, np.full(len(points), math.atan2(across[1], across[0])))
+    bare = world.clearance(points + 0.01 * across) > 0.005  # else along the side of an obstacle
+    return np.where(bare, far, np.inf)
+
+
+def _geometry(world: World, motion: Motion) -> Figures:
+    width = corridor_width(world)
+    circle = motion.turning_radius_m + motion.radius_m
+    x0, y0, x1, y1 = world.bounds
+    grid = np.mgrid[x0:x1:0.05, y0:y1:0.05].reshape(2, -1).T
+    return {
+        "step_m": motion.step_m,
+        "turn_per_action_deg": math.degrees(motion.turn_rad),
+        "turning_radius_m": motion.turning_radius_m,
+        "corridor_width_m": width,
+        "full_circle_needs_width_m": 2.0 * circle,
+        "full_circle_fits_narrowest_part": 2.0 * circle < width,
+        "full_circle_fits_somewhere": circle < float(world.clearance(grid).max()),
+    }
+
+
+def _best_run(planner: Planner) -> Figures:
+    first = _start_poses(planner.world)[:1]
+    return {"best_fitness_from_start": int(planner.drive(first, PLANNED_ACTIONS).survived[0])}
+
+
+def _laps(planner: Planner) -> Figures:
+    world = planner.world
+    if world.lap is None:
+        return {}
+    figures: Figures = {}
+    if len(world.walls) == 2:
+        middle = _centre_line_lap(world)
+        figures["centre_line_lap_m"] = middle
+        figures["centre_line_lap_actions"] = middle / planner.motion.step_m
+    for name, direction, keep in (
+        ("fastest_lap_left_actions", 1, 0.005),
+        ("fastest_lap_right_actions", -1, 0.005),
+        ("comfortable_lap_actions", 1, COMFORTABLE_M),
+    ):
+        starts = _start_poses(world)
+        figures[name] = min(_actions_per_lap(planner, pose, direction, keep) for pose in starts)
+    return figures
+
+
+def _actions_per_lap(
+    planner: Planner, pose: npt.NDArray[np.float64], direction: int, keep_m: float
+) -> float:
+    """Mean of one long run from a start; inf if it does not get round."""
+    run = planner.race(pose, _RACE_ACTIONS, direction, keep_m)
+    survived = int(run.survived[0])
+    angle = float(planner.winding(run.poses[: survived + 1, 0])[-1])
+    laps = direction * angle / (2.0 * math.pi)
+    return survived / laps if laps > 0.5 else math.inf
+
+
+def _tour(world: World, motion: Motion) -> Figures:
+    """How much of the route a planned run drives, and in how many actions."""
+    if world.route is None:
+        return {}
+    # A dead end may end the route, so the run need not be able to go on for ever.
+    planner = Planner(world, motion, horizon=_TOUR_HORIZON)
+    length = world.route.length_m
+    run = planner.tour(round(2.0 * length / motion.step_m))
+    driven = planner.progress(run.poses[: int(run.survived[0]) + 1, 0])
+    return {
+        "route_m": length,
+        "route_driven_m": float(driven.max()),
+        "route_driven_actions": int(driven.argmax()),
+    }
+
+
+def _centre_line_lap(world: World) -> float:
+    """Length of a lap at half the width of the narrowest side from the one island, cornered."""
+    island = world.walls[1]
+    width = min(float(np.median(_widths(world, segment))) for segment in island.segments)
+    ways = np.diff(np.array([*island.points, *island.points[:2]], np.float64), axis=0)
+    turns = np.diff(np.arctan2(ways[:, 1], ways[:, 0]))
+    # Clockwise, so a corner that sticks out turns right and makes the way longer.
+    mitres = np.tan(-np.remainder(turns + np.pi, 2 * np.pi) / 2.0 + np.pi / 2.0)
+    return float(island.lengths.sum() + width * mitres.sum())
+
+
+def _start_poses(world: World) -> npt.NDArray[np.float64]:
+    """x, y, heading of all starts, float64 [n, 3]."""
+    poses = [(s.x_m, s.y_m, math.radians(s.heading_deg)) for s in world.starts]
+    return np.array(poses, np.float64)
+
+
+def _random_figures(driven: RandomDrive) -> Figures:
+    return {
+        "random_actions_to_bump_mean": float(driven.runs.mean()),
+        "random_actions_to_bump_median": float(np.median(driven.runs)),
+        "random_bumps_in_first_action": float((driven.runs == 0).mean()),
+        "retreat_mean_m": float(driven.retreats_m.mean()),
+        "recoveries": len(driven.runs),
+    }
+
+
+def _saved(planner: Planner, driven: RandomDrive) -> Figures:
+    survived = planner.drive(driven.poses, PLANNED_ACTIONS).survived
+    return {
+        f"recoveries_saved_for_{PLANNED_ACTIONS}_actions": float(
+            (survived >= PLANNED_ACTIONS).mean()
+        ),
+        "best_fitness_after_recovery_mean": float(survived.mean()),
+    }
+
+
+def _render_times(robot: SimRobot, repeats: int = 100) -> Figures:
+    start = robot.world.starts[0]
+
+    def look(width: int, height: int) -> Callable[[int], object]:
+        return lambda i: robot.look_from(Pose(start.x_m, start.y_m, float(i)), width, height)
+
+    return {
+        f"render_{width}x{height}_ms": _mean_ms(look(width, height), repeats)
+        for width, height in ((75, 50), (150, 100))
+    }
+
+
+def _mean_ms(work: Callable[[int], object], repeats: int) -> float:
+    began = time.perf_counter()
+    for i in range(repeats):
+        work(i)
+    return (time.perf_counter() - began) / repeats * 1e3

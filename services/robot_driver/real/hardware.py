@@ -1,0 +1,289 @@
+"""A real robot behind any link: commands as leases, fresh sensors, stop on contact.
+
+Three threads touch it: the driver's, one that watches the bumper, and one that sends. The last one
+asks the `Gate` before every command, so a driver that hangs cannot keep a robot moving.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import TypeVar
+
+from services.robot_driver.real.gate import ZEROS, Gate
+from services.robot_driver.real.link import Link, Reading
+from services.robot_driver.real.odometry_frame import OdometryFrame
+from services.robot_driver.robot import (
+    STANDSTILL,
+    Felt,
+    NotReady,
+    Pose,
+    RobotFault,
+    Sensed,
+    Velocity,
+)
+from shared.config import RobotConfig
+
+TICK_S = 0.01
+"""How often lease, sensors and bumper are looked at while the robot moves."""
+REFUSALS = 3
+"""So many commands in a row that did not get through are told as the robot's problem."""
+CLOSING_S = 3.0
+"""Longest that `close` tries to send its stops."""
+T = TypeVar("T")
+log = logging.getLogger(__name__)
+
+
+class HardwareRobot:
+    """A robot as `robot.Robot`, reached through a link.
+
+    Args:
+        config: Limits, periods, and how old readings may be.
+        link: How the robot is reached; opened here, closed by `close`.
+        clock: Monotonic seconds, as the link stamps its readings with.
+
+    Raises:
+        RobotFault: The robot and its sensors did not all answer in time.
+    """
+
+    def __init__(
+        self, config: RobotConfig, link: Link, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._config, self._link, self._clock = config, link, clock
+        self._gate = Gate(config)
+        self._changed = threading.Condition()
+        """Guards the gate and everything below; told when something must be sent."""
+        self._frame = OdometryFrame()
+        self._unsent, self._unsent_reason = 0, ""
+        self._closing = self._closed = False
+        self._due_s = clock()
+        try:
+            self._open()
+        except BaseException:
+            link.close()
+            raise
+        self._threads = [
+            threading.Thread(target=self._send, name="command", daemon=True),
+            threading.Thread(target=self._watch, name="bumper-watch", daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def faults(self) -> Counter[str]:
+        """What went wrong so far, by what it was."""
+        faults = Counter(dict(self._link.faults))
+        faults["command: lease expired"] = self._gate.lease_stops
+        faults["odometry: jumped"] = self._frame.jumps
+        return +faults
+
+    def sense(self) -> Sensed:
+        """The newest picture, odometry and bumper. Raises NotReady when the robot is not fit."""
+        felt = self.feel()
+        return Sensed(felt.pose, felt.contact, _there(self._link.camera.get()))
+
+    def feel(self) -> Felt:
+        """The newest odometry and bumper. Raises NotReady when the robot is not fit to drive."""
+        self._check()
+        return Felt(self._pose(), _there(self._link.bumper.get()))
+
+    def drive(self, velocity: Velocity) -> None:
+        """Set the velocity, leased until `run` renews it.
+
+        Raises:
+            RobotFault: It is not finite or beyond the limits; the robot is told to stop then.
+            NotReady: The robot must not move now. Standstill is always taken.
+        """
+        with self._changed:
+            try:
+                self._gate.drive(velocity, self._clock())
+            finally:
+                self._changed.notify_all()
+        if velocity.moving:
+            self._check()
+
+    def run(self, duration_s: float, *, stop_on_contact: bool) -> bool:
+        """Let time pass while the bumper is watched.
+
+        Without `stop_on_contact` a slow robot may move with a pressed bumper, as far as a recovery
+        needs. Raises NotReady when the robot became unfit to drive; it is told to stop then.
+        """
+        now_s = self._clock()
+        self._due_s = max(self._due_s, now_s - duration_s) + duration_s
+        contact = False
+        while True:
+            with self._changed:
+                now_s = self._clock()
+                self._gate.renew(now_s, regardless=not stop_on_contact)
+                lapsed = self._gate.lapsed
+                contact |= self._gate.handled()
+                if contact and stop_on_contact:
+                    self._gate.drive(STANDSTILL, now_s)
+                    self._changed.notify_all()
+                left_s = self._due_s - now_s
+                if left_s > 0.0:
+                    self._changed.wait(min(left_s, TICK_S))
+            self._check(contact=contact)
+            if lapsed:
+                self.drive(STANDSTILL)
+                raise NotReady("driver: hung for longer than a velocity is leased", contact=contact)
+            if left_s <= 0.0:
+                return contact
+
+    def now_s(self) -> float:
+        """The monotonic clock."""
+        return self._clock()
+
+    def state(self) -> dict[str, float | int | str]:
+        """Nothing: a real robot stands where it stands."""
+        return {}
+
+    def restore(self, state: dict[str, float | int | str]) -> None:
+        """Continue from nothing. Raises ValueError for a state of another kind of robot."""
+        if state:
+            raise ValueError("robot state: is of a simulated robot")
+
+    def close(self) -> None:
+        """Tell the robot to stop, several times, then let go of it. May be called twice."""
+        with self._changed:
+            if self._closed:
+                return
+            self._closed = self._closing = True
+            self._gate.stop()
+            self._changed.notify_all()
+        for thread in self._threads:
+            thread.join(CLOSING_S)
+        if not self._gate.silent:  # its own thread could not: try from here
+            self._send_zeros()
+        self._link.close()
+
+    # ------------------------------------------------------------ fit to drive
+
+    def _check(self, *, contact: bool = False) -> None:
+        """Raise NotReady, the robot told to stop, when it must not move.
+
+        contact: What the exception tells of it.
+        """
+        with self._changed:
+            self._gate.problem = problem = self._problem(self._clock())
+            if self._gate.stuck:
+                problem = "bumper: stays pressed, recovery could not free it"
+            if problem:
+                self._gate.drive(STANDSTILL, self._clock())
+                self._changed.notify_all()
+        if problem:
+            raise NotReady(problem, contact=contact)
+
+    def _problem(self, now_s: float) -> str:
+        """Why the robot must not move now; empty when it may."""
+        link, ages = self._link, self._config.hardware
+        for name, reading, oldest_s in (
+            ("camera", link.camera.get(), ages.camera_stale_s),
+            ("odometry", link.odometry.get(), ages.odometry_stale_s),
+            ("bumper", link.bumper.get(), ages.bumper_stale_s),
+        ):
+            if reading is None:
+                return f"{name}: no reading yet"
+            if now_s - reading.stamp_s > oldest_s:
+                return f"{name}: nothing new for more than {oldest_s:g} s"
+        battery = link.battery.get()
+        if battery is not None and battery.value.low:
+            return "battery: low"
+        if obstacle := link.obstacle():
+            return obstacle
+        if self._unsent >= REFUSALS:
+            return f"command: does not get through: {self._unsent_reason}"
+        return ""
+
+    def _pose(self) -> Pose:
+        reading = self._link.odometry.get()
+        assert reading is not None, "checked before"
+        return self._frame.pose(reading.value, reading.stamp_s)
+
+    # ------------------------------------------------------------ threads
+
+    def _open(self) -> None:
+        self._link.open()
+        limit_s = self._clock() + self._config.hardware.open_timeout_s
+        for name, slot in (
+            ("odometry", self._link.odometry),
+            ("bumper", self._link.bumper),
+            ("camera", self._link.camera),
+        ):
+            if slot.wait(0, max(limit_s - self._clock(), 0.0)) is None:
+                faults = Counter(dict(self._link.faults))  # its threads go on counting
+                seen = ", ".join(f"{fault} ({n})" for fault, n in faults.most_common(3))
+                raise RobotFault(
+                    f"robot: no {name} within robot.hardware.open_timeout_s "
+                    f"({self._config.hardware.open_timeout_s:g} s)" + (f"; {seen}" if seen else "")
+                )
+
+    def _watch(self) -> None:
+        """Let the gate know of every reading of the bumper as soon as it comes."""
+        number = 0
+        while not self._closing:
+            reading = self._link.bumper.wait(number, 0.2)
+            if reading is None:
+                continue
+            number = reading.number
+            with self._changed:
+                self._gate.feel(reading.value, self._clock())
+                if reading.value:
+                    self._changed.notify_all()
+
+    def _send(self) -> None:
+        """Send what the gate lets through, until the last stop is sent."""
+        deadline_s = float("inf")
+        while True:
+            with self._changed:
+                now_s = self._clock()
+                if self._closing:
+                    deadline_s = min(deadline_s, now_s + CLOSING_S / 2.0)
+                    if self._gate.silent or now_s > deadline_s:
+                        return
+                if self._gate.wants_motion:
+                    self._gate.problem = self._problem_or_none(now_s)
+                velocity = self._gate.due(now_s)
+                if velocity is None:
+                    self._changed.wait(TICK_S if self._busy else 0.1)
+                    continue
+            self._hand_over(velocity)
+
+    def _problem_or_none(self, now_s: float) -> str:
+        """As `_problem`; a link that cannot even say is a problem, and no end of the sender."""
+        try:
+            return self._problem(now_s)
+        except Exception as error:
+            log.exception("looking at the robot failed")
+            return f"link: {type(error).__name__}: {error}"
+
+    @property
+    def _busy(self) -> bool:
+        return self._gate.wants_motion or not self._gate.silent
+
+    def _hand_over(self, velocity: Velocity) -> None:
+        """Send one velocity without holding up the others meanwhile."""
+        reason = ""
+        try:
+            self._link.send(velocity)
+        except RobotFault as error:
+            reason = str(error)
+        except Exception as error:  # the sender must never end silently
+            log.exception("sending failed")
+            reason = f"{type(error).__name__}: {error}"
+        with self._changed:
+            self._unsent = self._unsent + 1 if reason else 0
+            self._unsent_reason = reason
+            self._gate.sent(velocity, self._clock(), arrived=not reason)
+
+    def _send_zeros(self) -> None:
+        for _ in range(ZEROS):
+            self._hand_over(STANDSTILL)
+
+
+def _there(reading: Reading[T] | None) -> T:
+    assert reading is not None, "checked before"
+    return reading.value

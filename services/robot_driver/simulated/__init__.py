@@ -1,0 +1,1 @@
+"""The simulated robot: worlds as data, their scene in PyBullet, camera and bumper."""

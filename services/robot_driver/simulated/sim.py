@@ -1,0 +1,360 @@
+"""The simulated robot: kinematic motion in small steps, a ring bumper and a camera (A1, A2).
+
+What happens next depends on `state()` alone: on world and obstacles, pose, velocity, time and laps.
+PyBullet is only asked how far the nearest wall or obstacle is and what the camera sees, so a robot
+restored in another process continues bit for bit. Between actions the world may be changed:
+obstacles placed and removed, or another world put in its place.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import TypeAdapter, ValidationError
+
+from services.robot_driver.robot import STANDSTILL, Felt, Pose, Sensed, Velocity
+from services.robot_driver.simulated.scene import Scene
+from services.robot_driver.simulated.world import (
+    MAX_OBSTACLES,
+    Obstacle,
+    Start,
+    World,
+    WorldError,
+    load_world,
+)
+from shared.config import RobotConfig
+from shared.rl.preprocess import preprocess
+
+SUBSTEP_M = 0.01
+"""Longest way between two looks at the walls: far below their thickness."""
+SUBSTEP_RAD = math.radians(5.0)
+SKIN_M = 0.001
+"""The bumper is pressed while the gap to a wall is at most this."""
+GAP_M = 0.0002
+"""The shell never comes nearer to a wall than this."""
+_OBSTACLES = TypeAdapter(tuple[Obstacle, ...])
+_HALVINGS = 6
+"""Of a substep that would touch: what is left of 1 cm is well inside the skin."""
+
+
+class Laps(NamedTuple):
+    """Laps completed: net, anticlockwise (turning left round the island), clockwise."""
+
+    net: int
+    left: int
+    right: int
+
+
+def wrap(angle_rad: float) -> float:
+    """The same direction in -pi..pi."""
+    return math.remainder(angle_rad, 2.0 * math.pi)
+
+
+def advance(pose: Pose, velocity: Velocity, duration_s: float) -> Pose:
+    """Where constant body velocity leads without walls: exact, an arc when turning."""
+    turn = velocity.turn_rad_s * duration_s
+    forward, left = velocity.forward_m_s * duration_s, velocity.left_m_s * duration_s
+    half = turn / 2.0
+    chord = math.sin(half) / half if abs(half) > 1e-9 else 1.0
+    c, s = math.cos(pose.heading_rad + half), math.sin(pose.heading_rad + half)
+    return Pose(
+        pose.x_m + chord * (forward * c - left * s),
+        pose.y_m + chord * (forward * s + left * c),
+        wrap(pose.heading_rad + turn),
+    )
+
+
+class SimRobot:
+    """A Robotino in a world, as `robot.Robot`; deterministic and without noise.
+
+    Args:
+        config: Shape, camera and limits of the robot.
+        world: Where it drives; it starts at the first start pose.
+        seed: Reserved for worlds with chance in them; motion and camera have none.
+
+    Raises:
+        ValueError: The start pose touches a wall.
+    """
+
+    def __init__(self, config: RobotConfig, world: World, seed: int) -> None:
+        self.config = config
+        self.world = world
+        self.seed = seed
+        self.obstacles = world.obstacles
+        """What stands in the world now, in the order in which it was placed."""
+        self._pose = _pose_of(world.starts[0])
+        self._velocity = STANDSTILL
+        self._time_s = 0.0
+        self._winding_rad = 0.0
+        self._lap_start_rad = 0.0
+        self._left = self._right = 0
+        self._scene = self._at_start(world, 0)
+
+    @property
+    def pose(self) -> Pose:
+        """Where the robot is; without the cost of a picture."""
+        return self._pose
+
+    @property
+    def contact(self) -> bool:
+        """The ring bumper is pressed now, anywhere on the ring."""
+        return self._clearance(self._pose) <= SKIN_M
+
+    @property
+    def laps(self) -> Laps:
+        """Laps so far; one counts when 2 pi of new net angle round the lap centre is reached."""
+        return Laps(self._left - self._right, self._left, self._right)
+
+    def frame(self, width_px: int = 0, height_px: int = 0) -> npt.NDArray[np.uint8]:
+        """The camera picture before preprocessing: uint8 [h, w, 3], RGB."""
+        return self.look_from(self._pose, width_px, height_px)
+
+    def look_from(self, pose: Pose, width_px: int = 0, height_px: int = 0) -> npt.NDArray[np.uint8]:
+        """What the camera would see from another pose; the robot stays where it is."""
+        return self._scene.frame(pose, width_px, height_px)
+
+    def sense(self) -> Sensed:
+        """Camera, pose and bumper now."""
+        return Sensed(self._pose, self.contact, preprocess(self.frame()))
+
+    def feel(self) -> Felt:
+        """Pose and bumper now, without a picture."""
+        return Felt(self._pose, self.contact)
+
+    def drive(self, velocity: Velocity) -> None:
+        """Set the body velocity that holds until the next call."""
+        self._velocity = velocity
+
+    def run(self, duration_s: float, *, stop_on_contact: bool) -> bool:
+        """Let simulated time pass; return whether there was contact at any time (E11).
+
+        A part of a step that would touch a wall is not taken: translation is blocked, rotation
+        goes on. Driving off a wall is no contact. With `stop_on_contact` the velocity becomes
+        zero at the first contact.
+        """
+        steps = self._substeps(duration_s)
+        touched = False
+        free = self._clearance(self._pose)
+        for _ in range(steps):
+            if not self._velocity.moving:
+                break
+            free = self._substep(duration_s / steps, free)
+            if free <= SKIN_M:
+                touched = True
+                if stop_on_contact:
+                    self._velocity = STANDSTILL
+        self._time_s += duration_s
+        return touched or (not self._velocity.moving and free <= SKIN_M)
+
+    def now_s(self) -> float:
+        """Simulated time since the start."""
+        return self._time_s
+
+    def place(self, obstacle: Obstacle) -> None:
+        """Let a box stand in the world from now on.
+
+        Raises:
+            ValueError: One of that name stands there, it does not fit into the world, it overlaps
+                the robot, or there are too many. Nothing has changed then.
+        """
+        if any(other.name == obstacle.name for other in self.obstacles):
+            raise ValueError(f"there is already an obstacle {obstacle.name!r}")
+        if len(self.obstacles) >= MAX_OBSTACLES:
+            raise ValueError(f"there are {MAX_OBSTACLES} obstacles already")
+        self.world.check_obstacle(obstacle)
+        obstacles = (*self.obstacles, obstacle)
+        complaint = f"obstacle {obstacle.name!r} would overlap the robot"
+        self._show(self._built(self.world, obstacles, self._pose, GAP_M, complaint))
+        self.obstacles = obstacles
+
+    def remove(self, name: str) -> None:
+        """Take an obstacle away. Raises ValueError when there is none of that name."""
+        obstacles = tuple(other for other in self.obstacles if other.name != name)
+        if len(obstacles) == len(self.obstacles):
+            raise ValueError(f"there is no obstacle {name!r}")
+        self._show(Scene(self.world, self.config.radius_m, self.config.camera, obstacles))
+        self.obstacles = obstacles
+
+    def switch(self, world: World, start: int = 0) -> None:
+        """Stand still at a start pose of another world; its laps count on from the old ones'.
+
+        Raises:
+            ValueError: There is no such start pose, or it touches something. Nothing has changed
+                then.
+        """
+        if not 0 <= start < len(world.starts):
+            raise ValueError(
+                f"world {world.name!r}: expected a start from 0 to {len(world.starts) - 1}, "
+                f"got {start}"
+            )
+        self._show(self._at_start(world, start))
+        self.world, self.obstacles = world, world.obstacles
+        self._pose, self._velocity = _pose_of(world.starts[start]), STANDSTILL
+        self._winding_rad = self._lap_start_rad = 0.0
+
+    def state(self) -> dict[str, float | int | str]:
+        """Everything that decides what happens next."""
+        return {
+            "world": self.world.name,
+            "world_fingerprint": self.world.fingerprint,
+            "obstacles": json.dumps([obstacle.model_dump() for obstacle in self.obstacles]),
+            "x_m": self._pose.x_m,
+            "y_m": self._pose.y_m,
+            "heading_rad": self._pose.heading_rad,
+            "forward_m_s": self._velocity.forward_m_s,
+            "left_m_s": self._velocity.left_m_s,
+            "turn_rad_s": self._velocity.turn_rad_s,
+            "time_s": self._time_s,
+            "winding_rad": self._winding_rad,
+            "lap_start_rad": self._lap_start_rad,
+            "laps_left": self._left,
+            "laps_right": self._right,
+        }
+
+    def restore(self, state: dict[str, float | int | str]) -> None:
+        """Continue from `state()`, in its world.
+
+        Raises:
+            ValueError: A world that is not there or has changed, a missing or wrong value, or a
+                pose inside a wall or an obstacle. The robot is unchanged then.
+        """
+        if set(state) != set(self.state()):
+            odd = sorted(set(state) ^ set(self.state()))
+            raise ValueError(f"robot state: missing or unknown {', '.join(odd)}")
+        world, obstacles = self._world_of(state), _obstacles_of(state)
+        pose = Pose(*(_number(state, key) for key in ("x_m", "y_m", "heading_rad")))
+        speeds = ("forward_m_s", "left_m_s", "turn_rad_s")
+        velocity = Velocity(*(_number(state, key) for key in speeds))
+        times = [_number(state, key) for key in ("time_s", "winding_rad", "lap_start_rad")]
+        laps = [int(_number(state, key)) for key in ("laps_left", "laps_right")]
+        self._put(world, obstacles, pose)
+        self._pose, self._velocity = pose, velocity
+        self._time_s, self._winding_rad, self._lap_start_rad = times
+        self._left, self._right = laps
+
+    def close(self) -> None:
+        """Free the simulation. May be called twice."""
+        self._velocity = STANDSTILL
+        self._scene.close()
+
+    def _substeps(self, duration_s: float) -> int:
+        v = self._velocity
+        way = math.hypot(v.forward_m_s, v.left_m_s) * duration_s / SUBSTEP_M
+        turn = abs(v.turn_rad_s) * duration_s / SUBSTEP_RAD
+        return max(1, math.ceil(max(way, turn) - 1e-9))
+
+    def _substep(self, duration_s: float, free: float) -> float:
+        """Move as far as walls allow; return a lower bound of the gap, exact near walls."""
+        before = self._pose
+        after = advance(before, self._velocity, duration_s)
+        way = math.hypot(after.x_m - before.x_m, after.y_m - before.y_m)
+        free -= way
+        if free <= SKIN_M:
+            free = self._clearance(after)
+        if free < GAP_M and way > 0.0:
+            after, free = self._blocked(before, after)
+        self._pose = after
+        self._count_laps(before, after)
+        return free
+
+    def _blocked(self, before: Pose, after: Pose) -> tuple[Pose, float]:
+        """Turn as commanded, and move up to the wall but not into it."""
+        x, y = before.x_m, before.y_m
+        part = 1.0
+        for _ in range(_HALVINGS):
+            part /= 2.0
+            nearer = Pose(
+                x + part * (after.x_m - before.x_m),
+                y + part * (after.y_m - before.y_m),
+                after.heading_rad,
+            )
+            if self._clearance(nearer) >= GAP_M:
+                x, y = nearer.x_m, nearer.y_m
+        pose = Pose(x, y, after.heading_rad)
+        return pose, min(self._clearance(pose), SKIN_M)
+
+    def _count_laps(self, before: Pose, after: Pose) -> None:
+        if self.world.lap is None:
+            return
+        cx, cy = self.world.lap.centre
+        now = math.atan2(after.y_m - cy, after.x_m - cx)
+        self._winding_rad += wrap(now - math.atan2(before.y_m - cy, before.x_m - cx))
+        progress = self._winding_rad - self._lap_start_rad
+        if abs(progress) >= 2.0 * math.pi:
+            self._lap_start_rad += math.copysign(2.0 * math.pi, progress)
+            if progress > 0.0:
+                self._left += 1
+            else:
+                self._right += 1
+
+    def _clearance(self, pose: Pose) -> float:
+        return self._scene.clearance(pose.x_m, pose.y_m)
+
+    def _built(
+        self,
+        world: World,
+        obstacles: Sequence[Obstacle],
+        pose: Pose,
+        least_gap_m: float,
+        complaint: str,
+    ) -> Scene:
+        """A scene where a robot at this pose keeps that gap; else a ValueError with `complaint`."""
+        scene = Scene(world, self.config.radius_m, self.config.camera, obstacles)
+        if scene.clearance(pose.x_m, pose.y_m) < least_gap_m:
+            scene.close()
+            raise ValueError(complaint)
+        return scene
+
+    def _at_start(self, world: World, start: int) -> Scene:
+        pose = _pose_of(world.starts[start])
+        complaint = f"world {world.name!r}: starts.{start} touches a wall or an obstacle"
+        return self._built(world, world.obstacles, pose, SKIN_M, complaint)
+
+    def _show(self, scene: Scene) -> None:
+        self._scene.close()
+        self._scene = scene
+
+    def _put(self, world: World, obstacles: tuple[Obstacle, ...], pose: Pose) -> None:
+        """Be in this world; the pose is not taken up but must be possible there."""
+        complaint = f"robot state: ({pose.x_m}, {pose.y_m}) is inside a wall or an obstacle"
+        if not bool(world.between_walls(np.array([[pose.x_m, pose.y_m]]))[0]):
+            raise ValueError(complaint)
+        if (world, obstacles) != (self.world, self.obstacles):
+            self._show(self._built(world, obstacles, pose, GAP_M, complaint))
+            self.world, self.obstacles = world, obstacles
+        elif self._clearance(pose) < GAP_M:
+            raise ValueError(complaint)
+
+    def _world_of(self, state: dict[str, float | int | str]) -> World:
+        """The world that the state was saved in: the one at hand, or another that comes along."""
+        try:
+            same = state["world_fingerprint"] == self.world.fingerprint
+            world = self.world if same else load_world(str(state["world"]))
+        except WorldError as error:
+            raise ValueError(f"robot state: {error}") from error
+        if state["world_fingerprint"] != world.fingerprint:
+            raise ValueError(f"robot state: is of another world {world.name!r} than there is now")
+        return world
+
+
+def _pose_of(start: Start) -> Pose:
+    return Pose(start.x_m, start.y_m, wrap(math.radians(start.heading_deg)))
+
+
+def _obstacles_of(state: dict[str, float | int | str]) -> tuple[Obstacle, ...]:
+    try:
+        return _OBSTACLES.validate_json(str(state["obstacles"]))
+    except ValidationError as error:
+        raise ValueError(f"robot state: obstacles: {error.errors()[0]['msg']}") from error
+
+
+def _number(state: dict[str, float | int | str], key: str) -> float:
+    value = state[key]
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise ValueError(f"robot state: {key} must be a finite number, got {value!r}")
+    return float(value)

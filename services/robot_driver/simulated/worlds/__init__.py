@@ -1,0 +1,1 @@
+"""World files (TOML), read by `services.robot_driver.simulated.world`."""

@@ -1,1 +1,0 @@
-"""World files (TOML), read by `services.robot_driver.world`."""

@@ -1,0 +1,76 @@
+"""A link to a robot that is not there: readings stay fresh, commands are kept."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from services.robot_driver.real.link import Battery, Newest
+from services.robot_driver.robot import Pose, RobotFault, Velocity
+from shared.config import Config
+from shared.messages import ImageArray
+
+
+class FakeLink:
+    """Readings that stay fresh by themselves until they are held; commands are kept."""
+
+    def __init__(self) -> None:
+        self.camera: Newest[ImageArray] = Newest()
+        self.odometry: Newest[Pose] = Newest()
+        self.bumper: Newest[bool] = Newest()
+        self.battery: Newest[Battery] = Newest()
+        self.faults: Counter[str] = Counter()
+        self.told: list[Velocity] = []
+        self.held: set[str] = set()
+        self.pressed = self.low = self.refuses = False
+        self.hindrance = ""
+        self.closed = 0
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._refresh, daemon=True)
+
+    def open(self) -> None:
+        self._thread.start()
+
+    def obstacle(self) -> str:
+        return self.hindrance
+
+    def send(self, velocity: Velocity) -> None:
+        if self.refuses:
+            raise RobotFault("command: status 503")
+        self.told.append(velocity)
+
+    def close(self) -> None:
+        self.closed += 1
+        self._done.set()
+
+    def _refresh(self) -> None:
+        while not self._done.wait(0.005):
+            now_s = time.monotonic()
+            if "camera" not in self.held:
+                self.camera.put(np.full((50, 75), 7, np.uint8), now_s)
+            if "odometry" not in self.held:
+                self.odometry.put(Pose(1.0, 2.0, 0.5), now_s)
+            if "bumper" not in self.held:
+                self.bumper.put(self.pressed, now_s)
+            self.battery.put(Battery(self.low, None), now_s)
+
+
+def config_of(**robot: Any) -> Config:
+    tree = {
+        "kind": "robotino",
+        "timing": "realtime",
+        "period_s": 2.0,
+        "deadman_s": 3.0,
+        "hardware": {
+            "command_period_s": 0.02,
+            "camera_stale_s": 0.5,
+            "odometry_stale_s": 0.5,
+            "bumper_stale_s": 0.5,
+        },
+        **robot,
+    }
+    return Config.model_validate({"robot": tree})

@@ -1,0 +1,421 @@
+"""Images and compose files fit the code: roles, settings, health checks."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import threading
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+import zenoh
+from builders import LIFE, make_episode
+from fakes import fake_service, message
+
+from services.monitor import health
+from services.replay.storage import Storage
+from shared import settings
+from shared.bus import Bus, zenoh_config
+from shared.config import BusConfig, Config, RunConfig
+from shared.keys import ACTOR_STATE, LEARNER_STATE, REPLAY_STATE, ROBOT_STATE, Stream
+from shared.messages import ActorState, LearnerState, Message, ReplayState, RobotState
+from tests.compose.trial import Failed, Trial
+
+ROOT = Path(__file__).parents[2]
+DOCKERFILE = (ROOT / "Dockerfile").read_text()
+ROLES = ("driver", "actor", "replay", "learner")
+DRIVERS = {"sim": "driver-sim", "robotino": "driver-robotino", "ros2": "driver-ros2"}
+"""Service and image of each profile."""
+SERVICES = (*DRIVERS.values(), "actor", "replay", "learner")
+IMAGES = ("router", *SERVICES)
+FOREIGN = {
+    "pybullet": "pybullet",
+    "opencv-python-headless": "cv2",
+    "pillow": "PIL",
+    "httpx": "httpx",
+    "rosbags": "rosbags",
+    "openvino": "openvino",
+    "torch": "torch",
+    "safetensors": "safetensors",
+    "lmdb": "lmdb",
+    "tensorboard": "tensorboard",
+}
+"""Distributions that not every image holds, and what they are imported as."""
+MODULES = {
+    "router": "services.router.service, services.monitor.health, services.monitor.status",
+    "driver-sim": "services.robot_driver.service, services.robot_driver.simulated.sim, "
+    "services.monitor.health",
+    "driver-robotino": "services.robot_driver.service, services.robot_driver.real.hardware, "
+    "services.robot_driver.real.robotino, services.monitor.health",
+    "driver-ros2": "services.robot_driver.service, services.robot_driver.real.hardware, "
+    "services.monitor.health",
+    "actor": "services.actor.service, services.monitor.health",
+    "replay": "services.replay.service, services.monitor.health",
+    "learner": "services.learner.service, services.monitor.health",
+}
+
+
+def interpolated(text: str, variables: dict[str, str]) -> str:
+    """What compose makes of `${NAME:-default}`."""
+    return re.sub(r"\$\{(\w+):-([^}]*)\}", lambda m: variables.get(m[1]) or m[2], text)
+
+
+def compose(name: str, variables: dict[str, str] | None = None) -> dict[str, Any]:
+    tree: dict[str, Any] = yaml.safe_load(interpolated((ROOT / name).read_text(), variables or {}))
+    return tree
+
+
+def example() -> dict[str, str]:
+    """The variables of `.env.example`."""
+    lines = (ROOT / ".env.example").read_text().splitlines()
+    return dict(line.split("=", 1) for line in lines if line and not line.startswith("#"))
+
+
+def stages() -> dict[str, tuple[str, str]]:
+    """Build stages of the Dockerfile: name to (base, text)."""
+    parts = re.split(r"^FROM (\S+) AS (\S+)$", DOCKERFILE, flags=re.MULTILINE)[1:]
+    return {name: (base, text) for base, name, text in zip(*[iter(parts)] * 3, strict=True)}
+
+
+def extras(stage: str) -> set[str]:
+    """Extras of our package that a stage and the stages below it install."""
+    found: set[str] = set()
+    while stage in stages():
+        stage, text = stages()[stage]
+        for names in re.findall(r"'\.\[([\w,]+)\]'", text):
+            found |= set(names.split(","))
+    return found
+
+
+def distributions(names: set[str]) -> set[str]:
+    """What the extras bring, extras of extras included."""
+    optional = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    found: set[str] = set()
+    for name in names:
+        for requirement in optional[name]:
+            inner = re.match(r"corridor\[([\w,]+)\]", requirement)
+            if inner:
+                found |= distributions(set(inner[1].split(",")))
+            else:
+                found.add(re.split(r"[<>=\[]", requirement)[0])
+    return found
+
+
+# ---------------------------------------------------------------- images
+
+
+def role(name: str) -> str:
+    """The service that an image or a service of the compose file runs."""
+    return "driver" if name.startswith("driver-") else name
+
+
+def test_every_service_has_an_image_of_its_own_run_by_nobody_special() -> None:
+    for name in IMAGES:
+        text = stages()[name][1]
+        assert "COPY --from=code /code /opt/venv" in text
+        assert text.index("USER corridor") > text.index("COPY")
+        assert 'ENTRYPOINT ["corridor"]' in text
+        assert f'CMD ["{role(name)}"' in text
+    assert stages()["base"][0] == "${BASE_IMAGE}"
+
+
+def test_images_are_small_where_they_can_be() -> None:
+    assert distributions(extras("router")) == set()
+    for kind in ("robotino", "ros2"):
+        held = distributions(extras(DRIVERS[kind]))
+        assert held & {"torch", "pybullet", "opencv-python-headless", "openvino"} == set()
+    assert "torch" not in distributions(extras("driver-sim"))
+    for name in ("actor", "replay", "learner"):
+        held = distributions(extras(name))
+        assert "pybullet" not in held
+        assert ("openvino" in held) == (name != "learner")  # it predicts nothing
+
+
+@pytest.mark.parametrize("name", IMAGES)
+def test_an_image_holds_what_its_service_imports(name: str) -> None:
+    present = distributions(extras(name))
+    absent = [module for package, module in FOREIGN.items() if package not in present]
+    code = f"import sys; sys.modules.update(dict.fromkeys({absent})); import {MODULES[name]}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_preset_needs_no_library_of_experiments() -> None:
+    foreign = [*FOREIGN.values(), "gymnasium", "matplotlib", "jinja2"]
+    code = (
+        f"import sys; sys.modules.update(dict.fromkeys({foreign})); "
+        "from shared import settings; settings.load('demo'); import services.robot_driver.service"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_stage_that_installs_takes_the_index_it_is_told() -> None:
+    for name, (_, text) in stages().items():
+        if "pip install" in text:
+            assert "ARG PIP_INDEX_URL" in text, name
+
+
+def test_the_image_context_holds_what_is_copied() -> None:
+    allowed = {
+        line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line[:1] == "!"
+    }
+    copied: set[str] = set()
+    for line in re.findall(r"^COPY (?!--from)(.*)$", DOCKERFILE, flags=re.MULTILINE):
+        copied |= set(line.split()[:-1])
+    assert copied == allowed
+    assert all((ROOT / name).exists() for name in allowed)
+
+
+# ---------------------------------------------------------------- compose
+
+
+def test_compose_runs_every_service_with_restart_policy_and_health_check() -> None:
+    tree = compose("docker-compose.yml")
+    assert set(tree["services"]) == {"router", *SERVICES}
+    for name in SERVICES:
+        service = tree["services"][name]
+        assert service["build"]["target"] == name
+        assert service["image"] == f"corridor-{name}"
+        assert service["command"][0] == role(name)
+        assert service["restart"] == "on-failure"
+        assert service["depends_on"] == ["router"]
+        check = json.dumps(service["healthcheck"]["test"][1:])
+        assert f"CMD {check}" in stages()[name][1]
+    assert tree["services"]["router"]["restart"] == "unless-stopped"
+
+
+def test_containers_may_do_nothing_but_their_work() -> None:
+    for name, service in compose("docker-compose.yml")["services"].items():
+        assert service["read_only"] is True, name
+        assert service["cap_drop"] == ["ALL"]
+        assert service["security_opt"] == ["no-new-privileges:true"]
+        assert service["tmpfs"] == ["/tmp"]  # noqa: S108
+        assert {"cpus", "mem_limit", "pids_limit"} <= set(service)
+        assert "ports" not in service  # the router is for the compose network only
+        assert "privileged" not in service
+
+
+def test_state_lies_in_named_volumes() -> None:
+    tree = compose("docker-compose.yml")
+    for name in SERVICES:
+        assert tree["services"][name]["volumes"] == [f"{role(name)}:/data"]
+        assert role(name) in tree["volumes"]
+
+
+def test_a_profile_chooses_the_driver() -> None:
+    services = compose("docker-compose.yml")["services"]
+    chosen = {n: s["profiles"] for n, s in services.items() if "profiles" in s}
+    assert chosen == {name: [profile] for profile, name in DRIVERS.items()}
+    assert example()["COMPOSE_PROFILES"] in DRIVERS
+
+
+def test_the_router_is_zenohd_of_the_version_of_its_clients() -> None:
+    pins = (ROOT / "constraints.txt").read_text()
+    version = re.search(r"^eclipse-zenoh==(\S+)$", pins, flags=re.MULTILINE)
+    assert version is not None
+    router = compose("docker-compose.yml")["services"]["router"]
+    assert router["image"] == f"eclipse/zenoh:{version[1]}"
+    assert router["volumes"] == ["./deploy/router.json5:/etc/corridor/router.json5:ro"]
+    assert router["command"] == ["--config", "/etc/corridor/router.json5"]
+
+
+def test_zenohd_is_set_up_like_our_own_router() -> None:
+    theirs = zenoh.Config.from_file(str(ROOT / "deploy/router.json5"))
+    ours = zenoh_config("router", listen=["tcp/0.0.0.0:7447"], shared_memory=False)
+    for key in (
+        *("mode", "listen/endpoints", "connect/endpoints", "connect/timeout_ms", "connect/retry"),
+        *("scouting", "transport", "adminspace"),
+    ):
+        assert json.loads(theirs.get_json(key)) == json.loads(ours.get_json(key)), key
+
+
+def test_our_own_router_needs_no_other_image() -> None:
+    router = compose("docker-compose.own-router.yml")["services"]["router"]
+    assert router["image"] == "corridor-router"
+    assert router["build"]["target"] == "router"
+    assert router["command"][0] == "router"
+    check = json.dumps(router["healthcheck"]["test"][1:])
+    assert f"CMD {check}" in stages()["router"][1]
+
+
+@pytest.mark.parametrize("variables", [{}, example()], ids=["defaults", "example"])
+@pytest.mark.parametrize("gpu", [False, True], ids=["cpu", "gpu"])
+def test_all_services_get_the_same_valid_configuration(
+    variables: dict[str, str], gpu: bool
+) -> None:
+    found = set()
+    for service in SERVICES:
+        tree = compose("docker-compose.yml", variables)["services"][service]
+        environment = dict(tree["environment"])
+        if gpu:
+            more = compose("docker-compose.gpu.yml")["services"][service]["environment"]
+            environment.update(more)
+        config = settings.load(preset=tree["command"][2], env=environment)
+        assert config.bus.endpoint == "tcp/router:7447"
+        assert config.numerics.learner.device == ("cuda" if gpu else "auto")
+        found.add(config.fingerprint())
+    assert len(found) == 1
+
+
+def test_the_trial_takes_a_valid_configuration_of_all_services() -> None:
+    trial = compose("tests/compose/small.yml")["services"]
+    services = compose("docker-compose.yml")["services"]
+    assert set(trial) == {"driver-sim", "actor", "replay", "learner"}
+    for name, service in trial.items():
+        environment = {**services[name]["environment"], **service["environment"]}
+        config = settings.load("demo", env=environment)
+        assert (config.network.filters, config.episode.horizon) == (8, 20)
+
+
+def test_the_gpu_goes_to_those_whose_device_it_is() -> None:
+    tree = compose("docker-compose.gpu.yml")
+    assert {name for name, s in tree["services"].items() if "deploy" in s} == {"replay", "learner"}
+
+
+def test_the_example_names_the_variables_of_the_compose_files_and_no_others() -> None:
+    names = ("docker-compose.yml", "docker-compose.own-router.yml")
+    used = set(re.findall(r"\$\{(\w+)", "".join((ROOT / name).read_text() for name in names)))
+    assert used | {"COMPOSE_PROFILES"} == set(example())
+
+
+# ---------------------------------------------------------------- health
+
+
+@pytest.fixture
+def config(router: str, run_name: str) -> Config:
+    return Config(bus=BusConfig(endpoint=router, heartbeat_s=0.2), run=RunConfig(name=run_name))
+
+
+def sickness(name: str, config: Config) -> str:
+    """Why a service is not healthy."""
+    with pytest.raises(health.Sick) as caught:
+        health.check(name, config)
+    return str(caught.value)
+
+
+@contextmanager
+def beating(config: Config, stream: Stream, beat: Message, ident: str = "main") -> Iterator[None]:
+    """Send a heartbeat again and again while the block runs."""
+    done = threading.Event()
+    with Bus(config.bus, config.run.name) as bus:
+
+        def send() -> None:
+            while not done.wait(0.05):
+                bus.publish(stream, beat, ident)
+
+        thread = threading.Thread(target=send)
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()
+
+
+def test_a_router_is_healthy_when_it_accepts_sessions(config: Config) -> None:
+    assert health.check("router", config) == "accepts sessions"
+    nobody = config.model_copy(update={"bus": BusConfig(endpoint="tcp/127.0.0.1:9")})
+    assert "no Zenoh router at tcp/127.0.0.1:9" in sickness("router", nobody)
+
+
+def test_a_missing_service_is_not_healthy(config: Config) -> None:
+    for name in ROLES:
+        assert "nobody answers" in sickness(name, config)
+    assert "expected one of" in sickness("camera", config)
+
+
+def test_a_service_that_answers_but_does_not_work_is_not_healthy(config: Config) -> None:
+    for name in ("replay", "learner"):
+        with fake_service(config, name, "main", []):
+            assert "no heartbeat" in sickness(name, config)
+
+
+def test_a_service_with_a_heartbeat_is_healthy_and_tells_what_it_does(config: Config) -> None:
+    beat = message(ReplayState, id="main", activity="equalising", progress=0.25, episode=7)
+    with fake_service(config, "replay", "main", []), beating(config, REPLAY_STATE, beat):
+        assert health.check("replay", config) == "equalising, 25 %, episode 7"
+    fit = message(LearnerState, id="main", activity="fitting", fit_batch=1, fit_batches=2)
+    with fake_service(config, "learner", "main", []), beating(config, LEARNER_STATE, fit):
+        assert health.check("learner", config) == "fitting, epoch 0, 50 %, episode 0"
+
+
+def test_a_driver_whose_robot_stands_for_a_reason_is_healthy_and_says_so(config: Config) -> None:
+    robot = config.robot.id
+    beat = message(RobotState, robot=robot, state="blocked", reason="camera 0.8 s old")
+    with fake_service(config, "driver", robot, []), beating(config, ROBOT_STATE, beat, robot):
+        assert health.check("driver", config) == "blocked, camera 0.8 s old"
+
+
+def test_an_actor_needs_a_heartbeat_only_for_robots_that_observe(config: Config) -> None:
+    robot = config.robot.id
+    blocked = message(RobotState, robot=robot, state="blocked")
+    driving = message(RobotState, robot=robot, state="waiting")
+    acting = message(ActorState, id="main", robot=robot, phase="driving")
+    with fake_service(config, "actor", "main", []):
+        assert health.check("actor", config) == "waits for a robot"
+        with beating(config, ROBOT_STATE, blocked, robot):
+            assert health.check("actor", config) == "waits for a robot"
+        with beating(config, ROBOT_STATE, driving, robot):
+            assert "no heartbeat" in sickness("actor", config)
+            with beating(config, ACTOR_STATE, acting, robot):
+                assert health.check("actor", config) == f"driving for {robot}"
+
+
+def test_the_check_says_in_one_line_what_is_or_is_wrong(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, config: Config
+) -> None:
+    monkeypatch.setenv("CORRIDOR_BUS__ENDPOINT", config.bus.endpoint)
+    assert health.main(["router"]) == 0
+    assert health.main([]) == 1
+    monkeypatch.setenv("CORRIDOR_BUS__ENDPOINT", "tcp")
+    assert health.main(["router"]) == 1
+    said = capsys.readouterr()
+    assert said.out == "accepts sessions\n"
+    assert said.err.count("\n") == 2
+
+
+def test_what_the_trial_reads_from_disk_is_what_was_acknowledged(tmp_path: Path) -> None:
+    """`tests/compose/stored.py`, which runs in the replay image, and the trial's check of it."""
+    config = Config.model_validate({"run": {"name": "trial"}, "memory": {"fill": "none"}})
+    settings.claim(tmp_path, config)
+    storage = Storage(tmp_path / "replay", config.memory, f"trial/{config.run.seed}")
+    for number in (1, 2):
+        storage.commit(make_episode(5, seed=number, number=number))
+    storage.commit(make_episode(5, seed=2, number=2))  # again: not stored twice
+    storage.close()
+    done = subprocess.run(
+        [sys.executable, "tests/compose/stored.py", str(tmp_path)],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    stored = json.loads(done.stdout)
+    assert [tuple(item) for item in stored["submissions"]] == [
+        ("robot1", LIFE, 1),
+        ("robot1", LIFE, 2),
+    ]
+    trial = Trial()
+    trial.check_stored(stored, 2)
+    assert trial.passed
+    for wrong in (
+        {"counted": 1},  # fewer than were announced
+        {"submissions": stored["submissions"][:1]},
+        {"submissions": [stored["submissions"][0]] * 2},
+        {"submissions": [["robot1", LIFE, 1], ["robot1", LIFE, 3]]},
+        {"episodes": [1, 1]},
+    ):
+        with pytest.raises(Failed):
+            trial.check_stored(stored | wrong, 2)

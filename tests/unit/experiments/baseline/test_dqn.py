@@ -1,0 +1,128 @@
+"""The baseline beside ours: equal work, equal evaluation, its own reward; without its library."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.baseline import dqn
+from experiments.baseline.dqn import EVALUATIONS, DistanceReward, Plan, planned
+from experiments.drives.choosers import Chooser, uniform
+from experiments.environment import CorridorEnv
+from experiments.plans.plan import load_plan, stage_config
+from experiments.records import EVALUATION_COLUMNS, read_csv
+from experiments.report.run_folder import read_info
+from services.robot_driver.robot import Pose
+from shared.config import Config
+from shared.rl.policy import FORWARD, FORWARD_LEFT
+
+
+class Pretender:
+    """Learns nothing, and trains a mini-batch every four actions."""
+
+    greedy: Chooser = staticmethod(uniform)
+
+    def __init__(self) -> None:
+        self.actions = 0
+
+    def drive(self, actions: int) -> None:
+        self.actions += actions
+
+    @property
+    def train_steps(self) -> int:
+        return self.actions // 4
+
+
+def plan(out: Path) -> Plan:
+    words = ["--actions", "207", "--starts", "1", "--drive-actions", "30", "--out", str(out)]
+    return planned(words)
+
+
+def test_a_run_is_evaluated_at_equal_intervals_as_ours_is(tmp_path: Path) -> None:
+    dqn.run(plan(tmp_path / "seed-1"), Pretender())
+    rows = read_csv(tmp_path / "seed-1" / "evaluations.csv", EVALUATION_COLUMNS)
+    assert [int(row["total_actions"]) for row in rows] == [
+        207 * n // EVALUATIONS for n in range(1, EVALUATIONS + 1)
+    ]
+    assert [row["label"] for row in rows] == ["every"] * (EVALUATIONS - 1) + ["end"]
+    assert {row["actions"] for row in rows} == {"30"}
+    assert rows[-1]["train_steps"] == "51"
+
+
+def test_reports_can_read_what_was_run(tmp_path: Path) -> None:
+    chosen = plan(tmp_path)
+    dqn.run(chosen, Pretender())
+    info = read_info(tmp_path / "run.json")
+    assert (info.experiment, info.actions, info.train_steps, info.seed) == (
+        "dqn-progress", 207, 51, 1,
+    )  # fmt: skip
+    assert info.complete
+    command = json.loads((tmp_path / "run.json").read_text())["command"]
+    assert "--actions 207" in command
+    assert str(tmp_path) not in command
+
+
+def test_what_is_shared_with_ours_comes_from_the_plan() -> None:
+    words = "--like plus-minus --scale mini --seed 5 --threads 2 --reward distance --out x"
+    made = planned(words.split())
+    ours = load_plan("plus-minus", "mini")
+    config, last = made.config, stage_config(ours, len(ours.stages) - 1, 5)
+    assert (config.network, config.robot, config.episode) == (
+        last.network, last.robot, last.episode,
+    )  # fmt: skip
+    assert (config.memory.capacity, config.run.seed) == (last.memory.capacity, 5)
+    assert (made.scale, made.factor, config.numerics.learner.threads) == ("mini", 20, 2)
+
+
+def test_an_unknown_plan_is_refused_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert dqn.main(["--like", "nothing", "--out", "x"]) == 2
+    assert "got 'nothing'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", ["", "--actions 0 --out x", "--reward fame --out x"])
+def test_wrong_words_are_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        planned(words.split())
+    assert ended.value.code == 2
+
+
+def test_without_its_library_one_line_tells_how_to_get_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert dqn.main(["--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "make bench-peers" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_distance_is_from_50_actions_ago_or_the_begin_of_the_episode() -> None:
+    config = Config.model_validate({"episode": {"horizon": 4, "max_samples": 9}})
+    env = DistanceReward(CorridorEnv(config=config), config)
+    start = {"seed": 1, "options": {"pose": Pose(3.8, -2.5, math.pi / 2)}}
+    env.reset(**start)
+    straight = [env.step(np.int64(FORWARD))[1] for _ in range(7)]
+    assert straight == pytest.approx([0.25, 0.5, 0.75, 1.0, 1.0, 1.0, 1.0])
+    env.reset(**start)
+    assert env.step(np.int64(FORWARD))[1] == pytest.approx(0.25)
+    while True:
+        _, reward, bumped, _, _ = env.step(np.int64(FORWARD))
+        if bumped:
+            break
+    assert reward == -1.0
+    env.close()
+
+
+def test_distance_tells_circling_from_driving() -> None:
+    config = Config()
+    env = DistanceReward(CorridorEnv(config=config), config)
+    env.reset(seed=1, options={"pose": Pose(4.2, 0.0, math.pi / 2)})
+    rewards = [env.step(np.int64(FORWARD_LEFT))[1] for _ in range(100)]
+    assert max(rewards) < 0.12
+    env.close()

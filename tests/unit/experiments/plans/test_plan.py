@@ -1,0 +1,232 @@
+"""Experiments as data: the thesis's constants, the small scale, and what is refused."""
+
+from __future__ import annotations
+
+import pytest
+
+from experiments.plans.plan import SCALES, load_plan, merged, plan_names, read_plan, stage_config
+from services.robot_driver.simulated.world import load_world
+from shared.errors import ConfigError
+from shared.messages import WorldChange
+
+SMALL = """
+title = "t"
+source = "s"
+[[stages]]
+name = "a"
+until = 40
+[stages.config.memory]
+capacity = 400
+[[stages]]
+name = "b"
+until = 99
+[stages.config.learning]
+fit_every = 25
+mini_batches_per_episode = 2
+[mini]
+factor = 10
+mini_batches = 3
+"""
+THESIS = {
+    # stage by stage: episodes, memory, strategy, mini-batches, fit every, highest threshold, world
+    "plus-normm": [(15000, 45000, "normm", 1, 0, 7, "plus")],
+    "plus-normm-fit": [(5000, 45000, "normm", 5, 100, 7, "plus")],
+    "plus-rmm": [
+        (1000, 2000, "normm", 1, 0, 7, "plus"),
+        (2000, 45000, "normm", 1, 0, 7, "plus"),
+        (2999, 45000, "rmm", 0, 0, 3, "plus"),
+        (7000, 45000, "rmm", 0, 100, 3, "plus"),
+    ],
+    "plus-rmm-nopretrain": [(5000, 45000, "rmm", 5, 100, 3, "plus")],
+    "plus-minus": [
+        (1500, 50000, "rmm", 0, 100, 5, "minus"),
+        (3000, 50000, "rmm", 0, 100, 5, "plus"),
+    ],
+    "policy-roulette": [(1000, 2000, "normm", 1, 0, 7, "plus")],
+    "policy-roulette-4000": [(4000, 2000, "normm", 1, 0, 7, "plus")],
+}
+
+
+@pytest.mark.parametrize("name", THESIS)
+def test_full_scale_has_the_constants_of_the_thesis(name: str) -> None:
+    """A38-A43."""
+    plan = load_plan(name, "full")
+    found = []
+    for index, stage in enumerate(plan.stages):
+        config = stage_config(plan, index, 1)
+        memory, learning = config.memory, config.learning
+        found.append(
+            (
+                stage.until,
+                memory.capacity,
+                memory.strategy,
+                learning.mini_batches_per_episode,
+                learning.fit_every,
+                memory.threshold_max_percent,
+                config.robot.world,
+            )
+        )
+        assert memory.equalise_every == 50
+        assert config.network.filters == 64
+        assert learning.learning_rate == 0.00025
+    assert found == THESIS[name]
+
+
+def test_only_the_policy_differs_between_compared_policies() -> None:
+    """A38: equal weights and memory at the beginning come from an equal seed."""
+    configs = [
+        stage_config(load_plan(f"policy-{kind}", "full"), 0, 1).to_dict()
+        for kind in ("eps-greedy", "roulette", "eps-greedy-roulette")
+    ]
+    kinds = [config["policy"].pop("kind") for config in configs]
+    for config in configs:
+        del config["run"]["name"]
+    assert kinds == ["eps-greedy", "roulette", "eps-greedy-roulette"]
+    assert configs[0] == configs[1] == configs[2]
+
+
+@pytest.mark.parametrize(
+    ("ours", "beside"),
+    [("plus-minus", "plus-minus-normm"), ("plus-rmm-nopretrain", "plus-normm-fit-alone")],
+)
+def test_only_the_strategy_differs_between_compared_memories(ours: str, beside: str) -> None:
+    trees = [stage_config(load_plan(name, "mini"), 0, 1).to_dict() for name in (ours, beside)]
+    for tree in trees:
+        for key in ("threshold_percent", "threshold_max_percent"):  # of RMM alone
+            del tree["memory"][key]
+        del tree["run"]["name"]
+    assert [tree["memory"].pop("strategy") for tree in trees] == ["rmm", "normm"]
+    assert trees[0] == trees[1]
+
+
+@pytest.mark.parametrize(
+    ("name", "section", "changed"),
+    [
+        ("quotas", "memory", {"threshold_percent": (1, 100), "threshold_max_percent": (3, 100)}),
+        ("no-equalisation", "memory", {"equalise_every": (50, 0)}),
+        ("no-fits", "learning", {"fit_every": (100, 0)}),
+    ],
+)
+def test_rmm_is_taken_apart_one_part_at_a_time(
+    name: str, section: str, changed: dict[str, tuple[int, int]]
+) -> None:
+    whole, apart = (
+        stage_config(load_plan(plan, "full"), 0, 1).to_dict()
+        for plan in ("plus-rmm-nopretrain", f"plus-rmm-{name}")
+    )
+    del whole["run"]["name"], apart["run"]["name"]
+    for key, (before, after) in changed.items():
+        assert whole[section].pop(key) == before
+        assert apart[section].pop(key) == after
+    assert whole == apart
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_every_plan_can_be_run_after_its_predecessor(scale: str) -> None:
+    for name in plan_names():
+        plan = load_plan(name, scale)  # type: ignore[arg-type]
+        assert plan.after in ("", *plan_names())
+        if plan.after:  # goes on with the same network and seeds
+            before = load_plan(plan.after, scale)  # type: ignore[arg-type]
+            assert stage_config(before, 0, 1).network == stage_config(plan, 0, 1).network
+            assert plan.seeds == before.seeds
+
+
+def test_every_mini_plan_has_the_narrow_network_unless_it_says_otherwise() -> None:
+    config = stage_config(read_plan("small", SMALL, "mini"), 0, 1)
+    assert (config.network.filters, config.network.layout) == (16, "cpcccp")
+    assert (config.numerics.learner.batch, config.numerics.replay.engine) == (16, "auto")
+    own = SMALL + "[mini.config.network]\nfilters = 8\n[mini.config.numerics.learner]\nbatch = 4\n"
+    config = stage_config(read_plan("small", own, "mini"), 1, 1)
+    assert (config.network.filters, config.network.layout) == (8, "cpcccp")
+    assert config.numerics.learner.batch == 4
+    full = stage_config(read_plan("small", own, "full"), 0, 1)
+    assert full.network.filters == 64
+    assert (full.numerics.learner.batch, full.numerics.learner.device) == (8, "auto")
+
+
+def test_mini_divides_sizes_and_periods_and_nothing_else() -> None:
+    plan = read_plan("small", SMALL, "mini")
+    first, second = (stage_config(plan, i, 1) for i in (0, 1))
+    assert [stage.until for stage in plan.stages] == [4, 9]
+    assert (first.memory.capacity, first.memory.equalise_every) == (40, 5)
+    assert (first.learning.fit_every, second.learning.fit_every) == (10, 2)
+    assert first.learning.mini_batches_per_episode == 3  # of 1, the default
+    assert second.learning.mini_batches_per_episode == 6
+    assert second.memory.capacity == 40  # kept from the stage before
+    text = SMALL.replace("factor = 10", "factor = 10\nmemory_factor = 4")
+    assert stage_config(read_plan("small", text, "mini"), 0, 1).memory.capacity == 100
+    full = stage_config(read_plan("small", SMALL, "full"), 1, 1)
+    assert full.learning.mini_batches_per_episode == 2
+    assert full.network.filters == 64
+
+
+def test_a_plan_can_say_what_it_is_like() -> None:
+    plan = read_plan(
+        "other", 'like = "plus-minus"\ntitle = "t"\n[config.memory]\ncapacity = 60', "full"
+    )
+    model = load_plan("plus-minus", "full")
+    assert (plan.title, plan.after, plan.stages) == ("t", model.after, model.stages)
+    assert plan.config["memory"] == {**model.config["memory"], "capacity": 60}
+    assert not plan.thesis  # those figures are the other one's
+    with pytest.raises(ConfigError, match="plus-minus-normm is itself like plus-minus"):
+        read_plan("other", 'like = "plus-minus-normm"', "full")
+
+
+def test_merging_changes_neither_tree() -> None:
+    below, over = {"a": {"b": 1, "c": 2}}, {"a": {"b": 3}}
+    assert merged(below, over) == {"a": {"b": 3, "c": 2}}
+    assert (below, over) == ({"a": {"b": 1, "c": 2}}, {"a": {"b": 3}})
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (("until = 99", "until = 40"), "`until` must grow"),
+        (('name = "b"', 'name = "a"'), "names must differ"),
+        (("capacity = 400", 'capacity = "many"'), "stage a: memory.capacity"),
+        (("fit_every = 25", "fit_evry = 25"), "stage b: learning.fit_evry"),
+        (("factor = 10", "factor = 0"), "mini.factor"),
+        (('title = "t"', ""), "title"),
+        (("[[stages]]", "[[stages"), "expected TOML"),
+    ],
+)
+def test_a_wrong_plan_is_refused_in_one_line(change: tuple[str, str], complaint: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        read_plan("small", SMALL.replace(*change), "full")
+    assert complaint in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_plan_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(ConfigError, match="plus-rmm"):
+        load_plan("plus-rnm", "mini")
+
+
+def test_i16c_lets_the_memory_grow_and_marks_what_was_there_before() -> None:
+    """A44."""
+    plan = load_plan("i16c", "full")
+    memory = stage_config(plan, 0, 1).memory
+    assert (memory.capacity, memory.capacity_max, memory.capacity_step) == (50000, 90000, 5000)
+    assert (memory.threshold_percent, memory.threshold_max_percent) == (5, 7)
+    assert plan.stages[0].force_candidates
+    assert (plan.after, plan.stages[0].until) == ("plus-minus", 3000)
+    kinds = [change["kind"] for change in plan.stages[0].changes]
+    assert {"place", "remove"} <= set(kinds)
+    mini = stage_config(load_plan("i16c", "mini"), 0, 1).memory
+    assert (mini.capacity, mini.capacity_max, mini.capacity_step) == (10000, 18000, 1000)
+
+
+@pytest.mark.parametrize("name", plan_names())
+def test_obstacles_of_a_schedule_are_there_when_removed_and_not_when_placed(name: str) -> None:
+    plan = load_plan(name, "full")
+    for index, stage in enumerate(plan.stages):
+        world = load_world(stage_config(plan, index, 1).robot.world)
+        there = {obstacle.name for obstacle in world.obstacles}
+        for tree in sorted(stage.changes, key=lambda change: change["at_episode"]):
+            change = WorldChange.model_validate(tree)
+            if change.box is not None:
+                assert change.box.name not in there
+                there.add(change.box.name)
+            else:
+                there.remove(str(change.name))

@@ -1,0 +1,264 @@
+"""Runs of plans: stages, chains, records; stopped and continued, they are what they were to be."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import records
+from experiments.runs.schedule import Job, _distinct, chain, shares_of
+from experiments.plans.plan import Plan, read_plan
+from experiments.runs.run import Progress, Run
+from shared.errors import ConfigError, StateError
+
+TEXT = """
+title = "t"
+source = "s"
+{after}
+[config.network]
+filters = 4
+[config.memory]
+capacity = 60
+strategy = "normm"
+{fill}
+[config.learning]
+batch_size = 16
+[config.robot]
+world = "{first}"
+[config.numerics] # measured ones may differ between folders that share nothing
+actor = {{ engine = "torch", precision = "float32" }}
+replay = {{ device = "cpu", engine = "torch", threads = 1, precision = "float32" }}
+learner = {{ device = "cpu", threads = 1, precision = "float32" }}
+[[stages]]
+name = "a"
+until = 3
+[[stages]]
+name = "b"
+until = 7
+[stages.config.memory]
+capacity = 150
+fill = "{second_fill}"
+strategy = "rmm"
+threshold_percent = 2
+[stages.config.robot]
+world = "{second}"
+[[stages.changes]]
+kind = "place"
+at_episode = 5
+[stages.changes.box]
+name = "box"
+x_m = -3.8
+y_m = 0.9
+length_m = 0.2
+width_m = 0.2
+height_m = 1.0
+rgb = [200, 0, 0]
+[evaluation]
+every_actions = 60
+every_starts = 1
+every_length = 50
+starts = 1
+actions = 50
+lap_every_actions = 100
+[mini]
+factor = 1
+"""
+
+
+def plan(name: str, **parts: str) -> Plan:
+    given = {"after": "", "fill": "", "second_fill": "policy", "first": "plus", "second": "plus"}
+    return read_plan(name, TEXT.format(**{**given, **parts}), "full")
+
+
+FIRST = plan("one")
+GROWING = plan(
+    "growing",
+    fill="capacity_max = 400\ncapacity_step = 100\nrecompute_below = 999\nraise_at_most = 999",
+)
+SECOND = plan("two", after='after = "one"', first="minus", fill='fill = "none"', second_fill="none")
+
+
+def run(
+    a_plan: Plan,
+    folder: Path,
+    before: Path | None = None,
+    turns: int = 10**9,
+    episodes: int = 10**9,
+) -> bool:
+    """Run so many turns or episodes, or to the end; whether it came to it."""
+    done: list[Progress] = []
+    one = Run(a_plan, "full", 1, folder, before, "command")
+    try:
+        return one.go(done.append, lambda: len(done) >= turns or done[-1].episode >= episodes)
+    finally:
+        one.close()
+
+
+def tables(folder: Path) -> dict[str, list[dict[str, str]]]:
+    """All tables without the wall time."""
+    found = {
+        "episodes": records.read_csv(folder / "episodes.csv", records.EPISODE_COLUMNS),
+        "evaluations": records.read_csv(folder / "evaluations.csv", records.EVALUATION_COLUMNS),
+    }
+    for rows in found.values():
+        for row in rows:
+            del row[records.WALL_TIME]
+    return found
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A chain of two runs in one go."""
+    base = tmp_path_factory.mktemp("finished")
+    assert run(FIRST, base / "x" / "one")
+    assert run(SECOND, base / "x" / "two", base / "x" / "one")
+    return base / "x"
+
+
+def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(
+    finished: Path, tmp_path: Path
+) -> None:
+    """A46, and equal seeds give equal figures in every column but the wall time."""
+    one, two = tmp_path / "y" / "one", tmp_path / "y" / "two"
+    assert not run(FIRST, one, turns=2)  # while the memory is being filled
+    assert not run(FIRST, one, turns=6)
+    assert run(FIRST, one)
+    assert not run(SECOND, two, one, turns=5)  # just after the worlds changed
+    assert run(SECOND, two, one)
+    for name, folder in (("one", one), ("two", two)):
+        assert tables(folder) == tables(finished / name)
+        for weights in ("weights.safetensors", "best.safetensors"):
+            assert (folder / weights).read_bytes() == (finished / name / weights).read_bytes()
+
+
+def test_a_memory_that_has_grown_is_as_large_after_a_stop(tmp_path: Path) -> None:
+    """A44: the configured capacity counts as its stage begins, not as the run goes on."""
+    whole, parted = tmp_path / "whole" / "growing", tmp_path / "parted" / "growing"
+    assert run(GROWING, whole)
+    for episodes in (4, 5, 6):
+        assert not run(GROWING, parted, episodes=episodes)
+    assert run(GROWING, parted)
+    assert tables(parted) == tables(whole)
+    capacities = [int(row["capacity"]) for row in tables(whole)["episodes"]]
+    assert capacities == [60] * 3 + [250] * 4
+
+
+def test_stages_follow_each_other(finished: Path) -> None:
+    rows = tables(finished / "one")["episodes"]
+    assert [int(row["episode"]) for row in rows] == list(range(1, 8))
+    assert [row["stage"] for row in rows] == ["a"] * 3 + ["b"] * 4
+    assert all(int(row["memory"]) <= int(row["capacity"]) for row in rows)
+    assert [int(row["capacity"]) for row in rows] == [60] * 3 + [150] * 4
+    assert rows[-1]["threshold_percent"] == "2"
+    record = json.loads((finished / "one" / "run.json").read_text())
+    assert record["fill_actions"] >= 60 + 90  # E26: the larger memory is filled as well
+
+
+def test_a_chain_goes_on_where_its_predecessor_ended(finished: Path) -> None:
+    before, after = tables(finished / "one")["episodes"], tables(finished / "two")["episodes"]
+    assert int(after[0]["episode"]) == int(before[-1]["episode"]) + 1
+    assert int(after[0]["train_steps"]) == int(before[-1]["train_steps"]) + 1
+    assert [row["world"] for row in after] == ["minus"] * 3 + ["plus"] * 4
+    assert records.by_world(after[0]["by_world"]).keys() == {"plus", "minus"}
+    kept = records.by_world(before[-1]["by_world"])["plus"]
+    assert records.by_world(after[0]["by_world"])["plus"] <= kept
+
+
+def test_the_record_of_a_run_says_how_to_repeat_it(finished: Path) -> None:
+    record = json.loads((finished / "two" / "run.json").read_text())
+    assert (record["experiment"], record["after"], record["seed"]) == ("two", "one", 1)
+    assert record["complete"] is True
+    assert [stage["name"] for stage in record["stages"]] == ["a", "b"]
+    assert [stage["last_episode"] for stage in record["stages"]] == [10, 14]
+    with np.load(finished / "two" / "state-end" / "memory.npz") as file:
+        stored = file["rows"]
+    assert record["memory"] == {
+        "of_fill": pytest.approx(sum(stored["episode"] == 0) / len(stored), abs=1e-4),
+        "negative": pytest.approx(sum(stored["reward"] < 0) / len(stored), abs=1e-4),
+        "mean_reward": pytest.approx(sum(stored["reward"]) / len(stored), abs=1e-4),
+    }
+    for key in ("command", "commit", "machine", "torch", "prefill"):
+        assert record[key] or key == "commit"
+
+
+def test_every_stage_is_evaluated_and_so_are_floor_and_ceiling(finished: Path) -> None:
+    rows = tables(finished / "two")["evaluations"]
+    ends = [(row["stage"], row["world"]) for row in rows if row["label"].startswith("stage")]
+    assert ends == [("a", "minus"), ("b", "plus")]
+    floor = {(row["driver"], row["world"]) for row in rows if row["label"] == "reference"}
+    assert floor == {(d, w) for d in ("random", "planner") for w in ("minus", "plus")}
+
+
+def test_pictures_are_looked_at_as_every_stage_ends_and_with_the_best_weights(
+    finished: Path,
+) -> None:
+    found = {path.name for path in (finished / "two").glob("probes-*.npz")}
+    assert found == {"probes-a-minus.npz", "probes-b-plus.npz", "probes-best-plus.npz"}
+
+
+def test_the_longest_run_is_that_of_this_plan_alone(finished: Path) -> None:
+    """A46: not that of a predecessor, whose weights are others."""
+    for name in ("one", "two"):
+        longest = length = 0
+        for row in tables(finished / name)["episodes"]:
+            length += int(row["actions"]) - int(row["bump"])
+            longest = max(longest, length)
+            length = 0 if row["bump"] == "1" else length
+        record = json.loads((finished / name / "run.json").read_text())
+        assert record["longest_run"] == longest
+
+
+def test_a_finished_run_is_left_alone(finished: Path) -> None:
+    def files() -> dict[str, tuple[bytes, int]]:
+        return {
+            path.name: (path.read_bytes(), path.stat().st_mtime_ns)
+            for path in (finished / "two").iterdir()
+            if path.is_file()
+        }
+
+    before = files()
+    assert run(SECOND, finished / "two", finished / "one")
+    assert files() == before
+
+
+def test_a_run_without_its_predecessor_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(StateError, match="one, which has not been run to its end"):
+        run(SECOND, tmp_path / "two", tmp_path / "one")
+
+
+def test_the_folder_of_another_seed_is_refused(finished: Path) -> None:
+    with pytest.raises(ConfigError, match=r"run\.seed is 1 there, but 2 now"):
+        Run(FIRST, "full", 2, finished / "one", None, "command")
+
+
+def test_a_damaged_snapshot_is_refused(tmp_path: Path) -> None:
+    assert not run(FIRST, tmp_path / "one", turns=4)
+    (state,) = (tmp_path / "one").glob("state-*/state.msgpack")
+    state.write_bytes(state.read_bytes()[:-5])
+    with pytest.raises(StateError, match="damaged snapshot"):
+        run(FIRST, tmp_path / "one")
+
+
+def test_chains_begin_with_their_first_plan_and_share_runs() -> None:
+    assert [each.name for each in chain("plus-minus", "mini")] == ["plus-rmm", "plus-minus"]
+    jobs = {name: Job(name, "mini", 1, Path()) for name in ("a", "b", "c", "d")}
+    a, b, c, d = jobs.values()
+    assert _distinct([[a, b], [a, c], [d]]) == [[a, b, c], [d]]
+
+
+@pytest.mark.parametrize(
+    ("cores", "jobs", "shares"),
+    [
+        ([0, 1], 1, [{0, 1}]),
+        ([0, 1], 2, [{0}, {1}]),
+        ([3, 5, 7], 2, [{3, 7}, {5}]),
+        ([4], 3, [{4}, {4}, {4}]),
+    ],
+)
+def test_runs_side_by_side_divide_the_cores(
+    cores: list[int], jobs: int, shares: list[set[int]]
+) -> None:
+    assert shares_of(cores, jobs) == shares
