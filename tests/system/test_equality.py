@@ -22,14 +22,15 @@ def config() -> Config:
     """Everything that changes memory or weights happens within 62 episodes.
 
     Discards, growth and then a higher threshold, marks by decree, equalisation, fitting phases and
-    target copies.
+    target copies. What the network learns differs between processors, so nothing here depends on
+    it: every search looks for more candidates than there can be, and so late a decree leaves marks.
     """
     memory = {
         "capacity_max": 430,
         "capacity_step": 20,
-        "recompute_below": 60,
-        "raise_at_most": 100,
-        "mark_all_at_episode": 45,
+        "recompute_below": 500,
+        "raise_at_most": 500,
+        "mark_all_at_episode": EPISODES - 4,
     }
     return make_config("equality", run={"episodes": EPISODES}, memory=memory)
 
@@ -60,7 +61,7 @@ def test_undisturbed_run_equals_the_single_process_loop(
     with (tmp_path / "run" / "metrics" / "episodes.csv").open(newline="") as file:
         capacities = [int(row["capacity"]) for row in csv.DictReader(file)]
     assert state.capacity == capacities[-1] == reference.memory.capacity
-    assert set(capacities) == {400, 420, 430}
+    assert {420, 430} <= set(capacities) <= {400, 420, 430}
 
 
 def test_replay_learner_and_router_killed_at_random_moments_still_end_equal(
