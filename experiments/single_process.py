@@ -62,6 +62,7 @@ class SingleProcess:
         which change on the way, stay as they are.
         """
         self.config = config
+        self.counters = numbering.refill(self.counters, config.memory, len(self.memory))
         self.trainer.configure(config.learning)
         self.actor.configure(config)
         if self.actor.progress is not None:

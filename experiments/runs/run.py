@@ -27,6 +27,7 @@ from experiments.runs.episode_row import episode_row, held, memory_hash
 from experiments.drives.references import DRIVERS
 from experiments.single_process import SingleProcess, TurnDone
 from experiments.drives.traces import Figures
+from services.replay.numbering import bump_free
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import load_world
 from shared.config import Config
@@ -64,9 +65,9 @@ class Totals:
     lap_checked_at: int = -1
     first_lap: dict[str, float] = field(default_factory=dict)
     run_actions: int = 0
-    """Since the last bump, in this run."""
+    """Actions since the newest bump or interruption, in this run."""
     longest_run: int = 0
-    """Without a bump, in this run (E10)."""
+    """Most actions without a bump, in this run (E10, E43)."""
     prefill: str = ""
     """Hash of the memory as the first episode began: equal for all that shared it."""
     stages: list[dict[str, Any]] = field(default_factory=list)
@@ -341,15 +342,13 @@ class Run:
     # ------------------------------------------------------------ records
 
     def _record(self, done: TurnDone) -> None:
+        episode, totals = done.submitted, self._totals
+        totals.run_actions, length = bump_free(totals.run_actions, episode)
         if not done.commit.episode:
             return
-        episode, totals = done.submitted, self._totals
         self._fitness = [*self._fitness[-99:], episode.fitness]
-        totals.run_actions += episode.actions - int(episode.bump)
-        if totals.run_actions > totals.longest_run:
-            totals.longest_run, self._best = totals.run_actions, self._driving
-        if episode.bump:
-            totals.run_actions = 0
+        if length > totals.longest_run:
+            totals.longest_run, self._best = length, self._driving
         if done.target_changed:
             self._driving = to_bytes(self._loop.trainer.target_network)
         row = episode_row(self._loop, done, self._stage_name, totals.seconds)

@@ -18,7 +18,7 @@ from shared.rl.memory import ReplayMemory
 from shared.statefile import write_atomically
 
 CHECKPOINT, MEMORY, STATE = "checkpoint.safetensors", "memory.npz", "state.msgpack"
-SCHEMA = 1
+SCHEMA = 2
 
 
 def save(folder: Path, loop: SingleProcess, extra: dict[str, Any]) -> None:

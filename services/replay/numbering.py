@@ -16,13 +16,16 @@ from shared.messages import Episode, RobotProgress
 
 @dataclass(frozen=True)
 class RobotCounters:
-    """What is stored of one robot."""
+    """What replay counts of one robot."""
 
     fills: int = 0
     episodes: int = 0
     life: str = ""
     """Driver life of the newest stored sample."""
     last_sequence: int = -1
+    run_actions: int = 0
+    """Actions of counted episodes since the newest bump or interruption (E43)."""
+    longest_run_actions: int = 0
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class Counters:
     episode: int = 0
     next_id: int = 1
     filled: int = 0
-    """Samples stored to fill the memory."""
+    """Samples that the memory held, or was given, when it was last filled."""
     fill_surplus: int = 0
     """Samples of fill submissions beyond the capacity, not stored (A13)."""
     bumps: int = 0
@@ -43,18 +46,20 @@ class Counters:
     laps_right: int = 0
     dropped_samples: int = 0
     dropped_episodes: int = 0
-    run_actions: int = 0
-    """Actions since the last bump, across episodes (E10)."""
-    longest_run_actions: int = 0
     robots: dict[str, RobotCounters] = field(default_factory=dict)
 
+    @property
+    def longest_run_actions(self) -> int:
+        """Most actions that one robot drove without a bump, across episodes (E10, E43)."""
+        return max((robot.longest_run_actions for robot in self.robots.values()), default=0)
+
     def to_dict(self) -> dict[str, Any]:
-        """As plain values, for msgpack."""
+        """Return plain values that msgpack can write."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Counters:
-        """From `to_dict()`. Raises StateError when it is damaged."""
+        """Return what `to_dict()` was made of. Raises StateError when it is damaged."""
         try:
             robots = {name: RobotCounters(**robot) for name, robot in values["robots"].items()}
             return cls(**{**values, "robots": robots})
@@ -76,6 +81,14 @@ class Commit:
 def filling(counters: Counters, config: MemoryConfig) -> bool:
     """Whether the memory still awaits its first N samples (A13, E9)."""
     return config.fill != "none" and counters.filled < config.capacity
+
+
+def refill(counters: Counters, config: MemoryConfig, held: int) -> Counters:
+    """The counters as settings change while the memory holds `held` samples.
+
+    A larger memory is filled anew. What it holds counts, so that it ends with exactly N (E44).
+    """
+    return replace(counters, filled=held) if filling(counters, config) else counters
 
 
 def refusal(counters: Counters, config: MemoryConfig, episode: Episode) -> str:
@@ -106,7 +119,14 @@ def accept(counters: Counters, config: MemoryConfig, episode: Episode) -> tuple[
         stored, number = episode.count, counters.episode + 1
         robot = replace(robot, episodes=robot.episodes + 1)
         counters = _count_episode(counters, episode)
-    robot = replace(robot, life=episode.robot_life, last_sequence=episode.last_sequence)
+    run, length = bump_free(robot.run_actions, episode)
+    robot = replace(
+        robot,
+        life=episode.robot_life,
+        last_sequence=episode.last_sequence,
+        run_actions=run,
+        longest_run_actions=max(robot.longest_run_actions, length),
+    )
     commit = Commit(counters.commit + 1, number, counters.next_id, stored)
     return commit, replace(
         counters,
@@ -116,6 +136,21 @@ def accept(counters: Counters, config: MemoryConfig, episode: Episode) -> tuple[
         dropped_episodes=counters.dropped_episodes + episode.dropped_episodes,
         robots={**counters.robots, episode.robot: robot},
     )
+
+
+def bump_free(run: int, episode: Episode) -> tuple[int, int]:
+    """The run that goes on after a submission, and how long it was with it, in actions (E10, E43).
+
+    run: actions of the robot without a bump until then. A run excludes the bumping action and spans
+    episodes. A bump ends it at any time, and so does an interruption, of which a change of the
+    world is one. Actions that fill the memory do not count. Neither do those of an episode that was
+    dropped as a whole, which are at most the 50 of the look-ahead.
+    """
+    interrupted_before = episode.dropped_episodes > 0
+    new = episode.fitness if interrupted_before else episode.actions
+    counted = 0 if episode.fill else new - int(episode.bump)
+    length = counted + (0 if interrupted_before else run)
+    return length if episode.ended == "full" else 0, length
 
 
 def progress_of(counters: Counters, config: MemoryConfig, robot: str) -> RobotProgress:
@@ -135,8 +170,7 @@ def progress_of(counters: Counters, config: MemoryConfig, robot: str) -> RobotPr
 
 
 def _count_episode(counters: Counters, episode: Episode) -> Counters:
-    """Totals after a counted episode; a bump-free run excludes the bumping action (E10)."""
-    run = counters.run_actions + episode.actions - int(episode.bump)
+    """Totals after a counted episode."""
     return replace(
         counters,
         episode=counters.episode + 1,
@@ -144,6 +178,4 @@ def _count_episode(counters: Counters, episode: Episode) -> Counters:
         actions=counters.actions + episode.actions,
         laps_left=counters.laps_left + episode.laps_left,
         laps_right=counters.laps_right + episode.laps_right,
-        run_actions=0 if episode.bump else run,
-        longest_run_actions=max(counters.longest_run_actions, run),
     )

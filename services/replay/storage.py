@@ -213,5 +213,5 @@ def _summary(episode: Episode) -> dict[str, Any]:
 
 def _totals(counters: Counters) -> dict[str, int]:
     """Running totals for the metrics row of a commit."""
-    names = "bumps actions laps_left laps_right run_actions longest_run_actions"
+    names = "bumps actions laps_left laps_right longest_run_actions"
     return {name: getattr(counters, name) for name in names.split()}

@@ -34,7 +34,7 @@ from shared.errors import StateError
 from shared.messages import IMAGE_SHAPE
 from shared.rl.memory import SAMPLE
 
-SCHEMA = 2
+SCHEMA = 3
 MAP_BYTES = 1 << 38
 """Largest size of the file; only what is used exists."""
 REWARDS = np.dtype([("id", "<u8"), ("reward", "<f4")])

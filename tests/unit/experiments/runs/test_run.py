@@ -146,6 +146,13 @@ def test_a_memory_that_has_grown_is_as_large_after_a_stop(tmp_path: Path) -> Non
     assert capacities == [60] * 3 + [250] * 4
 
 
+def test_a_second_fill_ends_with_exactly_the_capacity(finished: Path) -> None:
+    """E44: although discards have left 59 of 60 samples when it begins."""
+    fourth = tables(finished / "one")["episodes"][3]
+    assert (fourth["stage"], fourth["ended"]) == ("b", "bump")
+    assert int(fourth["memory"]) + int(fourth["discarded"]) - int(fourth["actions"]) == 150
+
+
 def test_stages_follow_each_other(finished: Path) -> None:
     rows = tables(finished / "one")["episodes"]
     assert [int(row["episode"]) for row in rows] == list(range(1, 8))
@@ -206,7 +213,7 @@ def test_the_longest_run_is_that_of_this_plan_alone(finished: Path) -> None:
         for row in tables(finished / name)["episodes"]:
             length += int(row["actions"]) - int(row["bump"])
             longest = max(longest, length)
-            length = 0 if row["bump"] == "1" else length
+            length = length if row["ended"] == "full" else 0
         record = json.loads((finished / name / "run.json").read_text())
         assert record["longest_run"] == longest
 

@@ -16,6 +16,7 @@ from services.replay.numbering import (
     accept,
     filling,
     progress_of,
+    refill,
     refusal,
 )
 from shared.config import MemoryConfig
@@ -100,6 +101,7 @@ episodes = st.lists(
         st.sampled_from(["bump", "full", "interrupted"]),
         st.integers(0, 40),
         st.integers(0, 3),
+        st.booleans(),
     ),
     max_size=25,
 )
@@ -108,44 +110,97 @@ episodes = st.lists(
 @FAST
 @given(episodes)
 def test_totals_and_longest_run_equal_counting_action_by_action(
-    given_episodes: list[tuple[int, str, int, int]],
+    given_episodes: list[tuple[int, str, int, int, bool]],
 ) -> None:
-    """E10: a run counts actions without a bump, across episodes, without the bumping one."""
-    made = [
-        make_episode(
-            n,
-            ended=ended,
-            actions=actions + int(ended == "bump"),
-            dropped_samples=odd,
-            laps_left=odd,
-            laps_right=2 * odd,
-            dropped_episodes=int(odd == 3),
+    """E10, E43: a run counts actions without a bump, across episodes, without the bumping one."""
+    made = []
+    for n, ended, actions, odd, fill in given_episodes:
+        actions += int(ended == "bump")
+        made.append(
+            make_episode(
+                n,
+                robot=f"robot{n % 2}",
+                fill=fill,
+                ended=ended,
+                actions=actions,
+                fitness=max(actions - 7, int(ended == "bump")) if odd == 3 else actions + n,
+                dropped_samples=odd,
+                laps_left=odd,
+                laps_right=2 * odd,
+                dropped_episodes=int(odd == 3),
+            )
         )
-        for n, ended, actions, odd in given_episodes
-    ]
     _, counters = after(NO_FILL, *made)
-    run = longest = bumps = actions = 0
+    run, longest = {"robot0": 0, "robot1": 0}, {"robot0": 0, "robot1": 0}
     for episode in made:
-        for number in range(episode.actions):
-            actions += 1
-            if episode.bump and number == episode.actions - 1:
-                bumps, run = bumps + 1, 0
-            else:
-                run += 1
-                longest = max(longest, run)
-    assert (counters.run_actions, counters.longest_run_actions) == (run, longest)
-    assert (counters.bumps, counters.actions, counters.episode) == (bumps, actions, len(made))
-    assert counters.next_id == 1 + sum(e.count for e in made)
-    assert counters.laps_right == 2 * counters.laps_left == 2 * sum(e.laps_left for e in made)
+        if episode.dropped_episodes:  # interrupted before it began
+            run[episode.robot] = 0
+        driven = episode.fitness if episode.dropped_episodes else episode.actions
+        for number in range(0 if episode.fill else driven):
+            run[episode.robot] += int(not (episode.bump and number == driven - 1))
+            longest[episode.robot] = max(longest[episode.robot], run[episode.robot])
+        if episode.ended != "full":
+            run[episode.robot] = 0
+    for name, robot in counters.robots.items():
+        assert (robot.run_actions, robot.longest_run_actions) == (run[name], longest[name])
+    assert counters.longest_run_actions == max(longest.values())
+    counted = [e for e in made if not e.fill]
+    assert counters.episode == len(counted)
+    assert counters.bumps == sum(e.bump for e in counted)
+    assert counters.actions == sum(e.actions for e in counted)
+    assert counters.next_id == 1 + sum(e.count for e in counted)
+    assert counters.laps_right == 2 * counters.laps_left == 2 * sum(e.laps_left for e in counted)
     assert counters.dropped_samples == sum(e.dropped_samples for e in made)
     assert counters.dropped_episodes == sum(e.dropped_episodes for e in made)
 
 
+def test_a_run_goes_on_across_full_episodes_and_counts_before_it_ends() -> None:
+    _, counters = after(NO_FILL, *[make_episode(40, ended="full", seed=i) for i in range(3)])
+    assert counters.longest_run_actions == counters.robots["robot1"].run_actions == 120
+
+
+@pytest.mark.parametrize(
+    ("between", "longest"),
+    [
+        ({"ended": "bump", "fill": True}, 40),
+        ({"ended": "interrupted", "fill": True}, 40),
+        ({"ended": "full", "fill": True}, 80),
+        ({"ended": "interrupted", "actions": 9}, 49),
+        ({"ended": "full", "robot": "robot2", "actions": 9}, 80),
+        ({"ended": "bump", "robot": "robot2", "actions": 9}, 80),
+        ({"ended": "full", "dropped_episodes": 1, "actions": 9, "fitness": 5}, 45),
+    ],
+)
+def test_what_comes_between_two_stretches_ends_the_run_or_does_not(
+    between: dict[str, Any], longest: int
+) -> None:
+    """E43: per robot; a bump or an interruption ends it at any time, while filling too."""
+    stretch = {"ended": "full", "actions": 40}
+    _, counters = after(
+        NO_FILL, make_episode(9, **stretch), make_episode(9, **between), make_episode(9, **stretch)
+    )
+    assert counters.longest_run_actions == longest
+
+
+def test_a_larger_memory_is_filled_to_exactly_its_capacity() -> None:
+    """E44: what is held as a second fill begins counts, not what was stored to fill once."""
+    _, counters = after(CONFIG, make_episode(30, fill=True), make_episode(5))
+    larger = MemoryConfig(capacity=60)
+    counters = refill(counters, larger, held=29)
+    assert progress_of(counters, larger, "robot1").fill_missing == 31
+    assert refill(counters, larger, held=29) == counters  # also when it goes on
+    commit, counters = accept(counters, larger, make_episode(40, fill=True))
+    assert (commit.stored, filling(counters, larger)) == (31, False)
+    assert refill(counters, larger, held=59) == counters  # a discard is no reason to fill again
+
+
 @FAST
 @given(episodes)
-def test_counters_survive_the_way_to_disk(given_episodes: list[tuple[int, str, int, int]]) -> None:
+def test_counters_survive_the_way_to_disk(
+    given_episodes: list[tuple[int, str, int, int, bool]],
+) -> None:
     made = [
-        make_episode(n, ended=ended, robot=f"robot{odd}") for n, ended, _, odd in given_episodes
+        make_episode(n, ended=ended, robot=f"robot{odd}") for n, ended, _, odd, _ in given_episodes
     ]
     _, counters = after(NO_FILL, *made)
     stored = msgpack.unpackb(msgpack.packb(counters.to_dict()))

@@ -264,6 +264,19 @@ def test_a_search_begins_below_the_limit_of_candidates(candidates: int, expected
     assert list(found.ids) == [1, 2]
 
 
+@pytest.mark.parametrize(("forced", "capacity"), [(60, 300), (19, 310)])
+def test_candidates_by_decree_count_for_the_action_that_must_discard(
+    forced: int, capacity: int
+) -> None:
+    """E46: both limits are counts of that action alone, marks by decree included."""
+    bench = Bench(300, recompute_below=70, raise_at_most=40, capacity_max=400, capacity_step=10)
+    far = [(0, (2**11 - 1) << i) for i in range(0, 109, 2)]  # none looks like another
+    bench.add(*far, *[(0, 0)] * 21, *unlike(1, 25), *[(1, 0)] * 100, *[(2, 0)] * 100)
+    bench.force(*range(1, forced + 1))
+    found = bench.discard()
+    assert (found.recomputed, found.capacity) == (True, capacity)
+
+
 def test_few_candidates_of_an_action_below_its_quota_do_not_trigger_a_search() -> None:
     bench = Bench(300, recompute_below=10)
     bench.add(*[(0, 0)] * 101, *[(1, 0)] * 100, *[(2, 0)] * 100)
