@@ -50,12 +50,19 @@ def test_outputs_are_those_of_the_network(kind: str, filters: int, layout: str) 
     assert made.run(images, "sums") == pytest.approx(sums.numpy(), rel=1e-4, abs=1e-4)
 
 
+def openvino_rounds() -> bool:
+    """Whether OpenVINO computes in bfloat16 here; elsewhere it takes float32 instead."""
+    import openvino
+
+    return "BF16" in openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+
+
 @pytest.mark.parametrize("kind", ENGINES)
 def test_bfloat16_is_close(kind: str) -> None:
     network, images = make_network(16, "ccpccp"), make_images(8)
     exact = make_engine(kind, network).run(images, "values")
     reduced = make_engine(kind, network, precision="bfloat16").run(images, "values")
-    assert not np.array_equal(exact, reduced)
+    assert np.array_equal(exact, reduced) == (kind == "openvino" and not openvino_rounds())
     assert reduced == pytest.approx(exact, abs=0.02)
 
 

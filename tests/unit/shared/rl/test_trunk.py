@@ -13,6 +13,11 @@ from shared.rl.network import QNetwork, initialised
 
 torch.set_num_threads(1)
 LAYOUTS = ["ccpccp", "cpcccp"]
+ROUNDING = 2.0**-9
+"""bfloat16 keeps 8 bits: rounding changes a number by this part of it at most."""
+LARGEST_ERROR = 4 * 3 * ROUNDING
+"""Four stages, each with gradient, input and weight rounded: what adds up if all err one way.
+How much of it shows depends on the processor: some add in float32, some round in between."""
 
 
 def gradients(network: QNetwork, maps: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -39,7 +44,9 @@ def test_maps_are_the_same_bits_and_gradients_point_the_same_way(layout: Any, fi
         assert gradient.shape == expected[name].shape
         cosine = torch.cosine_similarity(gradient.flatten(), expected[name].flatten(), dim=0)
         assert float(cosine) > 0.999, name
-        assert float(gradient.norm() / expected[name].norm()) == pytest.approx(1.0, abs=0.01)
+        assert float(gradient.norm() / expected[name].norm()) == pytest.approx(
+            1.0, abs=LARGEST_ERROR
+        )
     whole = [torch.cat([g.flatten() for g in each.values()]) for each in (found, expected)]
     assert float(torch.cosine_similarity(*whole, dim=0)) > 0.9999
 
