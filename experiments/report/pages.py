@@ -95,8 +95,8 @@ def overview_blocks(
     names = ("experiment", "scale", "seed")
     numbers = Table(
         "Everything run, and the newest drives of the frozen network",
-        (*names, "seconds", "actions", "episodes", "gradient steps", "frozen in",
-         "bumps per 1,000", "laps per 1,000", "distance"),
+        (*names, "seconds", "actions", "episodes", "of one action, %", "gradient steps",
+         "frozen in", "bumps per 1,000", "laps per 1,000", "distance"),
         tuple(row for run in every for row in _number_rows(run)),
     )  # fmt: skip
     origins = Table(
@@ -113,14 +113,19 @@ def overview_blocks(
 def _number_rows(run: Run) -> list[tuple[str, ...]]:
     """One row per corridor driven in frozen, the run's own numbers in the first only."""
     info = run.info
-    own = (f"{info.seconds:,.0f}", f"{run.actions:,}", f"{len(run.episodes):,}",
-           f"{run.train_steps:,}")  # fmt: skip
+    own: tuple[str, ...] = (
+        f"{info.seconds:,.0f}",
+        f"{run.actions:,}",
+        f"{len(run.episodes):,}",
+        number(100.0 * run.one_action_share),
+        f"{run.train_steps:,}",
+    )
     worlds = dict.fromkeys(run.evaluations.where(driver="network").words("world")) or ["-"]
     rows = []
     for world in worlds:
         figures = tuple(number(evaluated(column, world)(run)) for column in EVALUATED)
         rows.append((info.experiment, info.scale, str(info.seed), *own, world, *figures))
-        own = ("", "", "", "")
+        own = ("",) * len(own)
     return rows
 
 

@@ -162,10 +162,10 @@ class Run:
     def actions(self) -> int:
         """Actions of this run's own episodes; `run.json` and evaluations count predecessors too.
 
-        A baseline records no episodes and has no predecessors: what `run.json` says.
+        A baseline records no episodes and has no predecessor: `run.json` counts its actions alone.
         """
         if not len(self.episodes):
-            return self.info.actions
+            return 0 if self.info.after else self.info.actions
         return int(np.nansum(self.episodes.numbers("actions")))
 
     @property
@@ -173,8 +173,14 @@ class Run:
         """Gradient steps of this run alone: those since its first episode, and that one's."""
         steps = self.episodes.numbers("train_steps")
         if not len(steps):
-            return self.info.train_steps
+            return 0 if self.info.after else self.info.train_steps
         return int(steps[-1] - steps[0] + self.episodes.numbers("mini_batches")[0])
+
+    @property
+    def one_action_share(self) -> float:
+        """Share of this run's episodes that lasted a single action (E11); NaN without episodes."""
+        actions = self.episodes.numbers("actions")
+        return float(np.mean(actions == 1)) if len(actions) else float("nan")
 
     @cached_property
     def runs_without_bump(self) -> Floats:

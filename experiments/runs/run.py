@@ -21,7 +21,7 @@ from experiments.runs import probes
 from experiments.drives import routes
 from experiments.runs import snapshot
 from experiments.runs.observer import Observer
-from experiments.plans.plan import Plan, Scale, Stage, stage_config
+from experiments.plans.plan import Plan, Scale, Stage, merged, stage_config
 from experiments.runs.provenance import machine, machine_key
 from experiments.runs.episode_row import episode_row, held, memory_hash
 from experiments.drives.references import DRIVERS
@@ -70,6 +70,8 @@ class Totals:
     """Most actions without a bump, in this run (E10, E43)."""
     prefill: str = ""
     """Hash of the memory as the first episode began: equal for all that shared it."""
+    one_action_episodes: int = 0
+    """Counted episodes of this run that lasted a single action (E11)."""
     stages: list[dict[str, Any]] = field(default_factory=list)
 
 
@@ -109,7 +111,7 @@ class Run:
         self._totals = Totals()
         self._stage = 0
         self._offset = 0
-        self._driving = self._best = to_bytes(self._loop.trainer.target_network)
+        self._driving = self._best = b""
         self._observer = Observer(self._config(0))
         self._fitness: list[int] = []
         self._restore(predecessor)
@@ -187,7 +189,9 @@ class Run:
             loop.memory.force_candidates(loop.memory.ids)
         # Both change on the way: a stage sets them where it says something new.
         first = not self._totals.stages
-        if first or before.memory.threshold_percent != config.memory.threshold_percent:
+        named = "threshold_percent" in merged(self.plan.config, stage.config).get("memory", {})
+        changed = before.memory.threshold_percent != config.memory.threshold_percent
+        if named if first else changed:  # a first stage that names none keeps it (E45)
             loop.threshold_percent = config.memory.threshold_percent
         if first or before.memory.capacity != config.memory.capacity:
             loop.memory.set_capacity(config.memory.capacity)
@@ -346,6 +350,7 @@ class Run:
         totals.run_actions, length = bump_free(totals.run_actions, episode)
         if not done.commit.episode:
             return
+        totals.one_action_episodes += episode.actions == 1
         self._fitness = [*self._fitness[-99:], episode.fitness]
         if length > totals.longest_run:
             totals.longest_run, self._best = length, self._driving
@@ -356,6 +361,7 @@ class Run:
 
     def _write_run(self, *, complete: bool) -> None:
         counters, plan, made = self._loop.counters, self.plan, machine()
+        episodes = counters.episode - self._offset
         memory = held(self._loop.memory)
         run = {
             "experiment": plan.name,
@@ -376,7 +382,8 @@ class Run:
             "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()) if complete else "",
             "complete": complete,
             "seconds": round(self._totals.seconds, 1),
-            "episodes": counters.episode - self._offset,
+            "episodes": episodes,
+            "one_action_share": _short(self._totals.one_action_episodes / max(episodes, 1)),
             "actions": counters.actions,
             "fill_actions": self._all_actions - counters.actions,
             "train_steps": self._loop.trainer.train_steps,
@@ -427,6 +434,7 @@ class Run:
             snapshot.restore(predecessor / END, self._loop)
             self._offset = self._loop.counters.episode
         self._driving = to_bytes(self._loop.trainer.target_network)
+        self._best = self._best or self._driving  # until an episode of this run was driven
         if not self.complete:
             self._drop_unsaved()
 

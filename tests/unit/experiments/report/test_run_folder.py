@@ -153,6 +153,27 @@ def test_counts_of_a_continued_run_leave_its_predecessor_out(tmp_path: Path) -> 
     assert continued.train_steps == int(rows[-1]["train_steps"]) - 100_000
 
 
+def test_a_run_without_episodes_counts_nothing_of_its_predecessor(tmp_path: Path) -> None:
+    """A test drive of trained weights neither learned nor drove its predecessor's actions."""
+    for after, actions, train_steps in (("i16c", 0, 0), ("", 900, 30)):
+        folder = write_run(
+            tmp_path / after, "i16c-test", 1, after=after, actions=900, train_steps=30
+        )
+        write_csv(folder / "episodes.csv", EPISODE_COLUMNS, [])
+        run = read_run(folder)
+        assert (run.actions, run.train_steps) == (actions, train_steps)
+        assert np.isnan(run.one_action_share)
+
+
+def test_the_share_of_episodes_of_one_action_is_counted(folder: Path) -> None:
+    """E11."""
+    rows = [dict(row) | {"actions": "2"} for row in read_run(folder).episodes.rows]
+    for row in rows[:25]:
+        row["actions"] = "1"
+    write_csv(folder / "episodes.csv", EPISODE_COLUMNS, rows)
+    assert read_run(folder).one_action_share == 0.25
+
+
 def test_a_stage_that_goes_on_ends_at_the_newest_episode(folder: Path) -> None:
     path = folder / "run.json"
     info = json.loads(path.read_text())

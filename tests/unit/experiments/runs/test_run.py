@@ -78,6 +78,22 @@ GROWING = plan(
     "growing",
     fill="capacity_max = 400\ncapacity_step = 100\nrecompute_below = 999\nraise_at_most = 999",
 )
+TEST_DRIVE = read_plan(
+    "drive",
+    """
+    title = "t"
+    source = "s"
+    after = "one"
+    tours = 1
+    [config]
+    network = { filters = 4 }
+    learning = { batch_size = 16 }
+    robot = { world = "i16c" }
+    [mini]
+    factor = 1
+    """,
+    "full",
+)
 SECOND = plan("two", after='after = "one"', first="minus", fill='fill = "none"', second_fill="none")
 
 
@@ -197,6 +213,46 @@ def test_every_stage_is_evaluated_and_so_are_floor_and_ceiling(finished: Path) -
     assert ends == [("a", "minus"), ("b", "plus")]
     floor = {(row["driver"], row["world"]) for row in rows if row["label"] == "reference"}
     assert floor == {(d, w) for d in ("random", "planner") for w in ("minus", "plus")}
+
+
+def test_a_plan_that_goes_on_keeps_its_threshold_unless_it_names_one(finished: Path) -> None:
+    """E45: the default is 1 %, and the predecessor ended with 2 %."""
+    assert SECOND.config["memory"].keys().isdisjoint({"threshold_percent"})
+    rows = tables(finished / "two")["episodes"]
+    assert [row["threshold_percent"] for row in rows] == ["2"] * 7
+
+
+def test_a_first_stage_that_names_a_threshold_begins_with_it(
+    finished: Path, tmp_path: Path
+) -> None:
+    naming = plan(
+        "naming",
+        after='after = "one"',
+        fill='fill = "none"\nthreshold_percent = 1',
+        second_fill="none",
+    )
+    assert not run(naming, tmp_path / "x" / "naming", finished / "one", episodes=1)
+    (row,) = tables(tmp_path / "x" / "naming")["episodes"]
+    assert row["threshold_percent"] == "1"
+
+
+def test_a_plan_without_stages_has_the_weights_that_it_goes_on_from(
+    finished: Path, tmp_path: Path
+) -> None:
+    """They are its best ones as well: the network it was made with has learned nothing."""
+    folder = tmp_path / "x" / "drive"
+    assert run(TEST_DRIVE, folder, finished / "one")
+    learned = (finished / "one" / "weights.safetensors").read_bytes()
+    assert (folder / "weights.safetensors").read_bytes() == learned
+    assert (folder / "best.safetensors").read_bytes() == learned
+
+
+def test_the_share_of_episodes_of_one_action_is_recorded(finished: Path) -> None:
+    """E11: also of a run that goes on from another, of its own episodes alone."""
+    for name in ("one", "two"):
+        single = [row["actions"] == "1" for row in tables(finished / name)["episodes"]]
+        record = json.loads((finished / name / "run.json").read_text())
+        assert record["one_action_share"] == pytest.approx(sum(single) / len(single), abs=1e-5)
 
 
 def test_pictures_are_looked_at_as_every_stage_ends_and_with_the_best_weights(
