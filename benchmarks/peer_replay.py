@@ -36,8 +36,9 @@ from benchmarks.transfer import EPISODE_SAMPLES, PATIENCE_S, bus, make_episode, 
 from services.launcher.up import free_endpoint
 from shared.bus import Bus
 from shared.config import Config
+from shared.facts import IMAGE_SHAPE
 from shared.keys import EPISODE, MINI_BATCH
-from shared.messages import IMAGE_SHAPE, Change, Episode, EpisodeAck, MiniBatchRequest
+from shared.messages import Change, Episode, EpisodeAck, MiniBatchRequest
 
 if TYPE_CHECKING:
     from benchmarks.peer_torchrl import Client

@@ -22,7 +22,8 @@ from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.data.replay_buffers.writers import RoundRobinWriter
 
 from experiments.runs.provenance import ROOT
-from shared.messages import IMAGE_SHAPE, Episode
+from shared.facts import IMAGE_SHAPE
+from shared.messages import Episode
 
 CLIENT, SERVER = "client", "replay"
 THREADS = 4

@@ -20,9 +20,8 @@ from services.robot_driver.robot import Pose
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import WORLDS, World, load_world
 from shared.config import Config
+from shared.facts import ACTION_COUNT, IMAGE_HEIGHT, IMAGE_WIDTH
 from shared.messages import Observation, image_array
-from shared.rl.policy import ACTIONS
-from shared.rl.preprocess import HEIGHT, WIDTH
 
 LIFE = "0" * 12
 """Life ids are random in the services; comparison ignores them."""
@@ -80,8 +79,8 @@ class CorridorEnv(gymnasium.Env[Image, np.int64]):
         self.driver = Driver(self.config, self.robot, LIFE)
         """Replaced when `reset` is given a seed."""
         self.render_mode = render_mode
-        self.observation_space = spaces.Box(0, 255, (HEIGHT, WIDTH, 1), np.uint8)
-        self.action_space = spaces.Discrete(ACTIONS)
+        self.observation_space = spaces.Box(0, 255, (IMAGE_HEIGHT, IMAGE_WIDTH, 1), np.uint8)
+        self.action_space = spaces.Discrete(ACTION_COUNT)
         self._start = self.robot.state()
         self._longest_m = chosen.speed_m_s * chosen.period_s
         self._seen: Observation | None = None
@@ -110,7 +109,7 @@ class CorridorEnv(gymnasium.Env[Image, np.int64]):
             ResetNeeded: There was no `reset` yet, or none since the bump.
         """
         if not self.action_space.contains(action):
-            raise InvalidAction(f"expected an action 0..{ACTIONS - 1}, got {action!r}")
+            raise InvalidAction(f"expected an action 0..{ACTION_COUNT - 1}, got {action!r}")
         before = self._seen
         if before is None or self._bumped:
             raise ResetNeeded("call reset() at first and after a bump")

@@ -15,7 +15,9 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,40}$")]
+from shared.facts import NAME
+
+Name = Annotated[str, Field(pattern=NAME.pattern)]
 """A run, robot or world name: it becomes part of a Zenoh key, so no '/', '*', '$' or spaces."""
 
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]

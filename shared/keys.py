@@ -12,13 +12,12 @@ request  asked for and answered; the asker repeats until answered or its deadlin
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from typing import Literal
 
 from shared import messages as m
+from shared.facts import NAME
 
-IDENT = re.compile(r"^[a-z0-9][a-z0-9_-]{0,40}$")
 KIB = 1024
 MIB = 1024 * 1024
 
@@ -48,9 +47,9 @@ class Stream:
     def key(self, run: str, ident: str = "") -> str:
         """The concrete key. Raises ValueError for a name that could widen the key."""
         for chunk in (run, *([ident] if "{id}" in self.pattern else [])):
-            if not IDENT.fullmatch(chunk):
+            if not NAME.fullmatch(chunk):
                 raise ValueError(
-                    f"key {self.pattern}: expected a name like {IDENT.pattern}, got {chunk!r}"
+                    f"key {self.pattern}: expected a name like {NAME.pattern}, got {chunk!r}"
                 )
         return self.pattern.format(run=run, id=ident)
 
@@ -66,7 +65,7 @@ def ident_in(stream: Stream, key: str) -> str | None:
         return None
     ident = "main"
     for expected, chunk in zip(pattern, chunks, strict=True):
-        if not IDENT.fullmatch(chunk) or (not expected.startswith("{") and chunk != expected):
+        if not NAME.fullmatch(chunk) or (not expected.startswith("{") and chunk != expected):
             return None
         if expected == "{id}":
             ident = chunk

@@ -14,19 +14,21 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from shared.facts import ACTION_COUNT, IMAGE_BYTES, IMAGE_SHAPE, NAME
+
 PROTOCOL_VERSION = 1
-IMAGE_SHAPE = (50, 75)
-IMAGE_BYTES = IMAGE_SHAPE[0] * IMAGE_SHAPE[1]
 MAX_EPISODE_SAMPLES = 5000
 """More samples than this in one episode are refused, whatever the configuration says."""
 
 ImageArray = npt.NDArray[np.uint8]
 Life = Annotated[str, Field(pattern=r"^[0-9a-f]{12}$")]
 """12 hex digits, drawn at process start; a clean stop saves it and the next start carries on."""
-Ident = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,40}$")]
+Ident = Annotated[str, Field(pattern=NAME.pattern)]
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 Few = Annotated[int, Field(ge=0, lt=2**31)]
 """Counted per submission and summed up for ever: bounded so that no sender can overflow a sum."""
+ActionValues = Annotated[tuple[float, ...], Field(min_length=ACTION_COUNT, max_length=ACTION_COUNT)]
+"""One prediction for each action, in the order of `facts.ACTIONS`."""
 Image = Annotated[bytes, Field(min_length=IMAGE_BYTES, max_length=IMAGE_BYTES)]
 """uint8 [50, 75] grey, row by row from the top left."""
 Channel = Annotated[int, Field(ge=0, le=255)]
@@ -102,13 +104,13 @@ class Action(Message):
     """Of the observation answered; the driver ignores any other than the one it waits on."""
     attempt: Count = 0
     """Of the observation answered."""
-    action: Annotated[int, Field(ge=0, le=2)] | None
+    action: Annotated[int, Field(ge=0, lt=ACTION_COUNT)] | None
     """0 forward, 1 forward/left, 2 forward/right (A21); None: hold still for one period."""
     motion: Motion = ""
     """Instead of an action, which is None then: move like this for one period. A driver that cannot
     holds still. It counts as no action: `sequence` stays, and the next observation says "moved"."""
     greedy: bool
-    values: tuple[float, float, float]
+    values: ActionValues
     """Clipped predictions Q(s, a) of the three actions, for the monitor."""
     weights_version: Count
     episode: Count = 0
@@ -568,7 +570,7 @@ class ActorState(Message):
     dropped_episodes: Count
     resent_episodes: Count
     undecodable: Count
-    values: tuple[float, float, float]
+    values: ActionValues
 
 
 class ServiceCommand(Message):

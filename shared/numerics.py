@@ -22,6 +22,7 @@ from pydantic import ValidationError
 
 from shared.config import Config, Numerics
 from shared.errors import ConfigError, StateError
+from shared.facts import IMAGE_SHAPE
 from shared.settings import read_folder
 from shared.statefile import create
 
@@ -147,7 +148,7 @@ def _predicting(config: Config, numerics: Numerics) -> Callable[[], object]:
 
     predictor = Predictor(config.network, numerics)
     predictor.load(1, to_bytes(initialised(config.network, seed=0)))
-    images = np.zeros((numerics.images_per_pass, 50, 75), np.uint8)
+    images = np.zeros((numerics.images_per_pass, *IMAGE_SHAPE), np.uint8)
     return lambda: predictor.all_values(images)
 
 
@@ -160,7 +161,7 @@ def _training(config: Config, numerics: Numerics) -> Callable[[], object]:
     rows = np.zeros(size, MIRROR)
     rows["id"] = np.arange(1, size + 1)
     samples = SampleStore()
-    samples.append(rows, np.zeros((size, 50, 75), np.uint8))
+    samples.append(rows, np.zeros((size, *IMAGE_SHAPE), np.uint8))
     trainer = Trainer(config.network, config.learning, numerics, seed=0)
     return lambda: trainer.step(samples, np.arange(size))
 

@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from shared.config import Config
-from shared.messages import IMAGE_BYTES, IMAGE_SHAPE, Episode, Observation
+from shared.facts import IMAGE_BYTES, IMAGE_SHAPE
+from shared.messages import Episode, Observation
 from shared.rl.memory import MIRROR, SAMPLE, ReplayMemory, SampleStore
 
 Images = npt.NDArray[np.uint8]

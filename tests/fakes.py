@@ -20,21 +20,28 @@ TEXTS = {"life": "0" * 12, "hash": "0" * 16, "config": "0" * 16}
 def message(cls: type[M], **given: Any) -> M:
     """A message with the given fields; the other required ones get the plainest valid value."""
     values = {
-        name: _plain(name, field.annotation)
+        name: _plain(name, field.annotation, _least(field.metadata))
         for name, field in cls.model_fields.items()
         if field.is_required()
     }
     return cls(**{**values, **given})
 
 
-def _plain(name: str, annotation: Any) -> Any:
+def _least(metadata: list[Any]) -> int:
+    """The shortest length a field allows."""
+    return next((item.min_length for item in metadata if hasattr(item, "min_length")), 1)
+
+
+def _plain(name: str, annotation: Any, least: int = 1) -> Any:
     if annotation is str:
         return next((text for end, text in TEXTS.items() if name.endswith(end)), "x")
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Literal:
         return arguments[0]
     if origin is tuple:
-        return tuple(_plain(name, argument) for argument in arguments if argument is not Ellipsis)
+        if arguments[-1] is Ellipsis:
+            return (_plain(name, arguments[0]),) * least
+        return tuple(_plain(name, argument) for argument in arguments)
     if NoneType in arguments:
         return None
     if hasattr(annotation, "__metadata__"):

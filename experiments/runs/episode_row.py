@@ -9,7 +9,7 @@ import numpy as np
 from experiments.records import MemoryRecord, Row
 from experiments.single_process import SingleProcess, TurnDone
 from shared.rl.memory import ReplayMemory
-from shared.rl.policy import FORWARD, FORWARD_LEFT, FORWARD_RIGHT
+from shared.facts import SHORT_NAMES
 
 
 def episode_row(loop: SingleProcess, done: TurnDone, stage: str, seconds: float) -> Row:
@@ -42,9 +42,7 @@ def episode_row(loop: SingleProcess, done: TurnDone, stage: str, seconds: float)
         "target_age": done.commit.episode - trainer.episode_at_copy,
         "memory": len(memory),
         "capacity": memory.capacity,
-        "forward": by_action[FORWARD],
-        "left": by_action[FORWARD_LEFT],
-        "right": by_action[FORWARD_RIGHT],
+        **dict(zip(SHORT_NAMES, by_action, strict=True)),
         "by_world": " ".join(f"{name}={count}" for name, count in counts),
         "discarded": len(discarded.ids),
         "last_resort": discarded.last_resort,

@@ -15,6 +15,7 @@ from services.actor.targets import Targets
 from shared import statefile
 from shared.codec import decode, encode
 from shared.errors import BadMessage, StateError
+from shared.facts import ACTION_COUNT
 from shared.keys import ACTION, PROGRESS
 from shared.messages import (
     Action,
@@ -150,7 +151,7 @@ class Session:
             dropped_episodes=self.actor.dropped_episodes,
             resent_episodes=self.resent_episodes,
             undecodable=0,
-            values=action.values if action else (0.0, 0.0, 0.0),
+            values=action.values if action else (0.0,) * ACTION_COUNT,
         )
 
     def save(self) -> None:
@@ -252,7 +253,7 @@ class Session:
                 attempt=observation.attempt,
                 action=None,
                 greedy=False,
-                values=(0.0, 0.0, 0.0),
+                values=(0.0,) * ACTION_COUNT,
                 weights_version=self.actor.predictor.version,
                 episode=self.actor.progress.robot_episodes if self.actor.progress else 0,
             )

@@ -13,7 +13,8 @@ from contextlib import contextmanager
 from shared.bus import Bus, Inbox
 from shared.config import Config
 from shared.errors import ConfigError, PeerMissing, RobotTaken
-from shared.keys import ACTION, IDENT, OBSERVATION, Peer
+from shared.facts import ACTION_COUNT, NAME
+from shared.keys import ACTION, OBSERVATION, Peer
 from shared.messages import PROTOCOL_VERSION, Action, Motion, Observation
 from shared.service import TICK_S, Service, StopFlag, answer_signals, controlled, new_life
 
@@ -22,7 +23,7 @@ LOOK_ROUND_S = 1.0
 """How often a commander looks whether it is still the only one."""
 FAREWELL_S = 0.6
 """How long a commander that leaves waits for the robot's next look, to answer it with a hold."""
-NO_VALUES = (0.0, 0.0, 0.0)
+NO_VALUES = (0.0,) * ACTION_COUNT
 
 
 class Commander:
@@ -67,7 +68,7 @@ class Commander:
         observation: Observation,
         action: int | None = None,
         motion: Motion = "",
-        values: tuple[float, float, float] = NO_VALUES,
+        values: tuple[float, ...] = NO_VALUES,
     ) -> None:
         """Answer an observation: an action, a motion, or neither: hold still."""
         message = Action(
@@ -160,8 +161,8 @@ def _choose(config: Config, peers: list[Peer], robot: str | None) -> tuple[str, 
         if len(drivers) > 1:
             raise ConfigError(f"--robot: expected one of {', '.join(sorted(drivers))}, got none")
         robot = next(iter(drivers))
-    if not IDENT.fullmatch(robot):
-        raise ConfigError(f"--robot: expected a name like {IDENT.pattern}, got {robot!r}")
+    if not NAME.fullmatch(robot):
+        raise ConfigError(f"--robot: expected a name like {NAME.pattern}, got {robot!r}")
     driver = drivers.get(robot)
     if driver is None:  # drivers of others need no token
         return robot, config.fingerprint()

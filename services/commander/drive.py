@@ -16,6 +16,7 @@ import numpy as np
 from services.commander import frozen
 from services.commander.commander import Commander, commanding
 from shared.config import Config, NetworkConfig
+from shared.facts import ACTIONS
 from shared.messages import Motion, Observation, image_array
 from shared.rl.draws import generator
 from shared.rl.policy import choose_greedily
@@ -25,7 +26,6 @@ from shared.service import TICK_S
 
 ROLE = "drive"
 TELL_EVERY_S = 2.0
-NAMES = ("forward", "forward/left", "forward/right")
 SILENT_S = 10.0
 """A robot that has said nothing for so long is mentioned."""
 
@@ -37,10 +37,10 @@ class Choice:
     action: int
     side: Side
     """Turn on the spot to this side instead; empty: drive."""
-    values: tuple[float, float, float]
+    values: tuple[float, ...]
 
     def __str__(self) -> str:
-        what = f"turn {self.side}" if self.side else NAMES[self.action]
+        what = f"turn {self.side}" if self.side else ACTIONS[self.action].name
         return f"{what:13} predicted " + " ".join(f"{value:+.2f}" for value in self.values)
 
 
@@ -63,7 +63,7 @@ class Mind:
         values = self._network.all_values(image_array(observation.image)[np.newaxis])[0]
         action = choose_greedily(values, self._draw)
         side = self._turns.decide(values, action)
-        return Choice(action, side, (float(values[0]), float(values[1]), float(values[2])))
+        return Choice(action, side, tuple(map(float, values)))
 
 
 @dataclass

@@ -8,8 +8,9 @@ import numpy as np
 
 from shared.bus import Bus
 from shared.errors import PeerSilent
+from shared.facts import IMAGE_SHAPE
 from shared.keys import CHANGES, SNAPSHOT
-from shared.messages import IMAGE_SHAPE, Change, ChangesRequest, FeedEnd, SnapshotRequest
+from shared.messages import Change, ChangesRequest, FeedEnd, SnapshotRequest
 from shared.rl.memory import MIRROR, SampleStore
 
 TRANSFER_TIMEOUT_S = 60.0

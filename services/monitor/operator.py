@@ -13,7 +13,8 @@ from shared.bus import Bus
 from shared.codec import first_problem
 from shared.config import Config
 from shared.errors import BadMessage, BusError, ConfigError, PeerMissing
-from shared.keys import IDENT, ROBOT_COMMAND, ROBOT_WORLD, SERVICE, Peer, Stream
+from shared.facts import NAME
+from shared.keys import ROBOT_COMMAND, ROBOT_WORLD, SERVICE, Peer, Stream
 from shared.messages import (
     Message,
     RobotCommand,
@@ -91,8 +92,8 @@ def _tell_robots(
     config: Config, what: str, robot: str | None, tell: Callable[[Bus, str], bool]
 ) -> int:
     """Tell one robot or all of the run something; 1 if `tell` was not obeyed or not answered."""
-    if robot is not None and not IDENT.match(robot):
-        raise ConfigError(f"--robot: expected a name like {IDENT.pattern}, got {robot!r}")
+    if robot is not None and not NAME.match(robot):
+        raise ConfigError(f"--robot: expected a name like {NAME.pattern}, got {robot!r}")
     with Bus(config.bus, config.run.name) as bus:
         present = [peer.id for peer in bus.peers() if peer.service == DRIVER]
         names = [robot] if robot is not None else present

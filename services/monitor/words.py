@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from shared.facts import SHORT_NAMES
 from shared.messages import LearnerState, ReplayState
 
-ACTIONS = ("forward", "left", "right")
 DESCRIPTOR_BITS = 120
 """Length of a descriptor, of which the threshold is a part (A29)."""
 
@@ -19,7 +19,7 @@ def duration(seconds: float) -> str:
 
 def by_action(counts: Sequence[int]) -> str:
     """Counts by action, named."""
-    return "  ".join(f"{name} {count}" for name, count in zip(ACTIONS, counts, strict=True))
+    return "  ".join(f"{name} {count}" for name, count in zip(SHORT_NAMES, counts, strict=True))
 
 
 def fitness(replay: ReplayState) -> str:

@@ -31,7 +31,7 @@ from services.replay.footprint import Mapping
 from services.replay.numbering import Commit, Counters
 from shared.config import MemoryConfig
 from shared.errors import StateError
-from shared.messages import IMAGE_SHAPE
+from shared.facts import IMAGE_SHAPE
 from shared.rl.memory import SAMPLE
 
 SCHEMA = 3

@@ -16,6 +16,7 @@ from services.robot_driver.robot import STANDSTILL, NotReady, Pose, Robot, Veloc
 from services.robot_driver.safety import Safety
 from services.robot_driver.world_changes import Changes, Outcome, described
 from shared.config import Config
+from shared.facts import ACTIONS
 from shared.messages import (
     MAX_FAULTS,
     Action,
@@ -28,7 +29,6 @@ from shared.messages import (
     WorldChanged,
 )
 from shared.rl.draws import generator
-from shared.rl.policy import FORWARD_LEFT, FORWARD_RIGHT
 
 State = Literal["waiting", "driving", "recovering", "blocked", "paused", "estop", "stopped"]
 SLICE_S = 0.02
@@ -37,8 +37,8 @@ SLICE_S = 0.02
 
 def action_velocity(config: Config, action: int) -> Velocity:
     """Body velocity of an action (A21): forward, turning for forward/left and forward/right."""
-    sense = {FORWARD_LEFT: 1.0, FORWARD_RIGHT: -1.0}.get(action, 0.0)
-    return Velocity(config.robot.speed_m_s, 0.0, sense * config.robot.turn_rad_s)
+    turn_rad_s = ACTIONS[action].turn * config.robot.turn_rad_s
+    return Velocity(config.robot.speed_m_s, 0.0, turn_rad_s)
 
 
 def motion_velocity(config: Config, motion: Motion) -> Velocity:

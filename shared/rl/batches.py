@@ -9,13 +9,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from shared.facts import MIRRORED
 from shared.rl.memory import SampleStore
-from shared.rl.policy import FORWARD, FORWARD_LEFT, FORWARD_RIGHT
 
 Ranks = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
-MIRRORED = (FORWARD, FORWARD_RIGHT, FORWARD_LEFT)
-"""The actions, as seen in a mirror."""
 
 
 class Batch(NamedTuple):

@@ -12,9 +12,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from shared.facts import ACTION_COUNT, IMAGE_SHAPE
 from shared.rl.descriptor import BLOCKS, block_sums
-from shared.rl.network import IMAGE_HEIGHT, IMAGE_WIDTH, QNetwork, channels_last
-from shared.rl.policy import ACTIONS
+from shared.rl.network import QNetwork, channels_last
 
 if TYPE_CHECKING:
     from shared.config import Numerics
@@ -23,7 +23,7 @@ Images = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float32]
 Head = Literal["values", "sums"]
 """Clipped Q(s, a) of all actions [n, 3], or the sums descriptors are made of [n, 16]."""
-WIDTHS: dict[Head, int] = {"values": ACTIONS, "sums": BLOCKS}
+WIDTHS: dict[Head, int] = {"values": ACTION_COUNT, "sums": BLOCKS}
 Progress = Callable[[int, int], None]
 """Called with (images done, images in all)."""
 
@@ -120,7 +120,7 @@ def padded(images: Images, size: int) -> Iterator[tuple[Images, int, int]]:
         part = images[start : start + size]
         count = len(part)
         if count < size:
-            filled = np.zeros((size, IMAGE_HEIGHT, IMAGE_WIDTH), np.uint8)
+            filled = np.zeros((size, *IMAGE_SHAPE), np.uint8)
             filled[:count] = part
             part = filled
         yield part, count, start + count

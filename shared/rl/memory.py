@@ -11,9 +11,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from shared.facts import ACTION_COUNT, IMAGE_SHAPE
 from shared.rl.descriptor import BYTES
-from shared.rl.network import IMAGE_HEIGHT, IMAGE_WIDTH
-from shared.rl.policy import ACTIONS
 
 Ids = npt.NDArray[np.uint64]
 Mask = npt.NDArray[np.bool_]
@@ -70,9 +69,9 @@ class SampleStore:
         rows: [k] with every field but `slot` set; images: uint8 [k, 50, 75], copied. Raises
         ValueError when sizes, order, actions or rewards are wrong; nothing is stored then.
         """
-        if images.shape != (len(rows), IMAGE_HEIGHT, IMAGE_WIDTH) or images.dtype != np.uint8:
+        if images.shape != (len(rows), *IMAGE_SHAPE) or images.dtype != np.uint8:
             raise ValueError(
-                f"images: expected uint8 [{len(rows)}, {IMAGE_HEIGHT}, {IMAGE_WIDTH}], "
+                f"images: expected uint8 {[len(rows), *IMAGE_SHAPE]}, "
                 f"got {images.dtype} {list(images.shape)}"
             )
         if not len(rows):
@@ -80,8 +79,8 @@ class SampleStore:
         ids = rows["id"]
         if (len(self) and ids[0] <= self.ids[-1]) or np.any(ids[1:] <= ids[:-1]):
             raise ValueError("insertion numbers must grow")
-        if rows["action"].max() >= ACTIONS:
-            raise ValueError(f"action: expected 0..{ACTIONS - 1}, got {rows['action'].max()}")
+        if rows["action"].max() >= ACTION_COUNT:
+            raise ValueError(f"action: expected 0..{ACTION_COUNT - 1}, got {rows['action'].max()}")
         if not np.all(np.abs(rows["reward"]) <= 1.0):
             raise ValueError("reward: expected -1..1")
         added = rows.astype(self.rows.dtype, copy=True)
@@ -115,7 +114,7 @@ class SampleStore:
     def images(self, ranks: npt.NDArray[np.int64]) -> Images:
         """Copies of the images at these ranks: uint8 [k, 50, 75]."""
         slots = self.rows["slot"][ranks]
-        images = np.empty((len(slots), IMAGE_HEIGHT, IMAGE_WIDTH), np.uint8)
+        images = np.empty((len(slots), *IMAGE_SHAPE), np.uint8)
         blocks, places = np.divmod(slots, BLOCK)
         for block in np.unique(blocks):
             here = blocks == block
@@ -130,7 +129,7 @@ class SampleStore:
 
     def by_action(self) -> list[int]:
         """Number of samples of each action."""
-        return [int(n) for n in np.bincount(self.rows["action"], minlength=ACTIONS)]
+        return [int(n) for n in np.bincount(self.rows["action"], minlength=ACTION_COUNT)]
 
     def check_valid(self) -> None:
         """Raise AssertionError naming the first invariant that does not hold."""
@@ -140,7 +139,7 @@ class SampleStore:
         for holds, invariant in (
             (bool(np.all(self.ids[1:] > self.ids[:-1])), "insertion numbers grow"),
             (places == list(range(len(self._blocks) * BLOCK)), "each slot is used or free, once"),
-            (not len(self) or int(self.rows["action"].max()) < ACTIONS, "actions are known"),
+            (not len(self) or int(self.rows["action"].max()) < ACTION_COUNT, "actions are known"),
             (bool(np.all(np.abs(rewards) <= 1.0)), "rewards lie in [-1, 1]"),
         ):
             if not holds:
@@ -149,7 +148,7 @@ class SampleStore:
     def _take_slots(self, count: int) -> npt.NDArray[np.uint32]:
         while len(self._free) < count:
             start = len(self._blocks) * BLOCK
-            self._blocks.append(np.empty((BLOCK, IMAGE_HEIGHT, IMAGE_WIDTH), np.uint8))
+            self._blocks.append(np.empty((BLOCK, *IMAGE_SHAPE), np.uint8))
             self._free = list(range(start + BLOCK - 1, start - 1, -1)) + self._free
         taken = self._free[-count:][::-1]
         del self._free[-count:]
@@ -191,7 +190,7 @@ class ReplayMemory(SampleStore):
     def candidates_by_action(self) -> list[int]:
         """Number of discard candidates of each action."""
         marked = self.rows["action"][self.rows["candidate"]]
-        return [int(n) for n in np.bincount(marked, minlength=ACTIONS)]
+        return [int(n) for n in np.bincount(marked, minlength=ACTION_COUNT)]
 
     def force_candidates(self, ids: Ids) -> None:
         """Mark samples by decree (A44): the marks stay until the samples are discarded."""

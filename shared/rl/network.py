@@ -12,16 +12,14 @@ from safetensors.torch import save as save_safetensors
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (the customary name)
 
+from shared.facts import ACTION_BITS, ACTIONS
 from shared.rl.draws import generator
 
 if TYPE_CHECKING:
     from shared.config import NetworkConfig
 
-IMAGE_HEIGHT, IMAGE_WIDTH = 50, 75
 MAP_HEIGHT, MAP_WIDTH = 9, 15
 """MaxPool2 maps: valid padding, stride 1, floor pooling (E16)."""
-ACTION_VECTORS = ((1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (1.0, 0.0, 1.0))
-"""A21; the first bit is always 1 and kept for shape fidelity (E35)."""
 POOLED = {"ccpccp": (False, True, False, True), "cpcccp": (True, False, False, True)}
 """Which of the four convolutions a pool follows, by layout (E16)."""
 MAX_WEIGHT_BYTES = 64 * 1024 * 1024
@@ -42,10 +40,12 @@ class QNetwork(nn.Module):
         self.conv3 = nn.Conv2d(filters, filters, 3)
         self.conv4 = nn.Conv2d(filters, filters, 3)
         self.fconn1 = nn.Linear(filters * MAP_HEIGHT * MAP_WIDTH, 128)
-        self.fconn2 = nn.Linear(3, 32)
+        self.fconn2 = nn.Linear(ACTION_BITS, 32)
         self.fconn3 = nn.Linear(128 + 32, 128)
         self.out = nn.Linear(128, 1)
-        self.register_buffer("action_vectors", torch.tensor(ACTION_VECTORS), persistent=False)
+        self.register_buffer(
+            "action_vectors", torch.tensor([action.vector for action in ACTIONS]), persistent=False
+        )
 
     @property
     def convolutions(self) -> tuple[nn.Conv2d, ...]:
@@ -72,7 +72,7 @@ class QNetwork(nn.Module):
         return self._out(state, action)
 
     def all_values(self, maps: Tensor) -> Tensor:
-        """Unclipped Q(s, a) [n, 3] of all actions: one trunk, three heads."""
+        """Unclipped Q(s, a) [n, actions] of all actions: one trunk, three heads."""
         state = F.relu(self.fconn1(maps.flatten(1)))
         encoded = F.relu(self.fconn2(self.action_vectors))
         n, actions = len(state), len(encoded)

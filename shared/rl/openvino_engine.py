@@ -11,10 +11,10 @@ import numpy as np
 import openvino as ov
 from openvino import opset13 as ops
 
+from shared.facts import ACTION_COUNT, IMAGE_SHAPE
 from shared.rl.descriptor import BLOCKS
 from shared.rl.engine import WIDTHS, Floats, Head, Images, Progress
-from shared.rl.network import IMAGE_HEIGHT, IMAGE_WIDTH, MAP_WIDTH, QNetwork
-from shared.rl.policy import ACTIONS
+from shared.rl.network import MAP_WIDTH, QNetwork
 
 if TYPE_CHECKING:
     from shared.config import Numerics
@@ -76,7 +76,7 @@ class OpenVinoEngine:
 
 def _maps(p: Parameters, pooled: tuple[bool, ...]) -> tuple[ov.Output, ov.Node]:
     """MaxPool2 maps of a parameter uint8 [n, 50, 75], and that parameter."""
-    images = ops.parameter([-1, IMAGE_HEIGHT, IMAGE_WIDTH], ov.Type.u8)
+    images = ops.parameter([-1, *IMAGE_SHAPE], ov.Type.u8)
     x = ops.unsqueeze(ops.convert(images, "f32"), _int(1))
     x = ops.divide(x, np.float32(255.0))
     for number, pools in enumerate(pooled, 1):
@@ -104,7 +104,7 @@ def _values(maps: ov.Output, p: Parameters, actions: Floats) -> ov.Output:
     of_state = ops.unsqueeze(_product(state, p["fconn3.weight"][:, :size]), _int(1))
     hidden = ops.relu(ops.add(of_state, of_action[None].astype(np.float32)))
     out = ops.add(_product(hidden, p["out.weight"]), p["out.bias"])
-    flat_out = ops.reshape(out, np.array([-1, ACTIONS]), special_zero=False)
+    flat_out = ops.reshape(out, np.array([-1, ACTION_COUNT]), special_zero=False)
     return ops.clamp(flat_out, -1.0, 1.0).output(0)
 
 

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from shared.facts import ACTION_COUNT
+
 if TYPE_CHECKING:
     from shared.config import PolicyConfig
 
-ACTIONS = 3
-FORWARD, FORWARD_LEFT, FORWARD_RIGHT = range(ACTIONS)
 Values = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 
@@ -63,7 +63,7 @@ def choose_greedily(values: Values, rng: np.random.Generator) -> int:
 
 def choose_uniformly(rng: np.random.Generator) -> int:
     """A uniformly random action, to fill the memory before learning starts (E9)."""
-    return int(rng.integers(ACTIONS))
+    return int(rng.integers(ACTION_COUNT))
 
 
 def _pick(chances: Floats, draw: float) -> int:

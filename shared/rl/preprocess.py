@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from shared.facts import IMAGE_HEIGHT, IMAGE_SHAPE, IMAGE_WIDTH
+
 PREPROCESS_VERSION = 2
 """2: exact means. 1 left their last bit to OpenCV."""
-
-HEIGHT, WIDTH = 50, 75
-"""Shape of the result; 16:9 frames are squeezed into it (E29)."""
 
 _BT601 = np.array([4899, 9617, 1868], np.int32)
 """Luma weights 0.299, 0.587, 0.114 of BT.601 in units of 2**-14; they sum up to exactly 2**14."""
@@ -36,7 +35,7 @@ def preprocess(frame: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     """
     if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or 0 in frame.shape:
         raise ValueError(f"expected a uint8 [h, w, 3] frame, got {frame.dtype} {frame.shape}")
-    if frame.shape[:2] != (HEIGHT, WIDTH):
+    if frame.shape[:2] != IMAGE_SHAPE:
         frame = _resized(frame)
     luma = frame.astype(np.int32) @ _BT601
     return ((luma + (1 << 13)) >> 14).astype(np.uint8)
@@ -45,8 +44,8 @@ def preprocess(frame: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
 def _resized(frame: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     """uint8 [50, 75, 3]: the means over the areas that pixels of the result cover in the frame."""
     height, width = frame.shape[:2]
-    rows = _area_sums(frame, HEIGHT, np.int32)
-    sums = _area_sums(rows.swapaxes(0, 1), WIDTH, np.int64).swapaxes(0, 1)
+    rows = _area_sums(frame, IMAGE_HEIGHT, np.int32)
+    sums = _area_sums(rows.swapaxes(0, 1), IMAGE_WIDTH, np.int64).swapaxes(0, 1)
     area = height * width
     return np.asarray((2 * sums + area) // (2 * area), np.uint8)
 

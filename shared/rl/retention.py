@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from shared.facts import ACTION_COUNT
 from shared.rl.descriptor import threshold_bits
 from shared.rl.memory import Ids, Images, ReplayMemory
-from shared.rl.policy import ACTIONS
 from shared.rl.similarity import similar_to_newer
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def normm_keep(capacity: int) -> int:
 
 def rmm_share(capacity: int) -> int:
     """Samples RMM keeps of an action above its share: floor(0.99 N / 3) (A33, E22)."""
-    return 99 * capacity // (100 * ACTIONS)
+    return 99 * capacity // (100 * ACTION_COUNT)
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def recompute_marks(
     for some, images in memory.parts(outdated):
         memory.rows["descriptor"][some] = describe(images)
         memory.rows["described_by"][some] = version
-    for action in range(ACTIONS):
+    for action in range(ACTION_COUNT):
         own = np.flatnonzero(memory.rows["action"] == action)
         similar = similar_to_newer(memory.rows["descriptor"][own], bits, config.rule)
         memory.rows["candidate"][own] = similar | memory.rows["forced"][own]
@@ -124,7 +124,7 @@ def _surplus(memory: ReplayMemory, capacity: int) -> dict[int, int]:
     return {
         action: count - rmm_share(capacity)
         for action, count in enumerate(memory.by_action())
-        if ACTIONS * count > capacity
+        if ACTION_COUNT * count > capacity
     }
 
 

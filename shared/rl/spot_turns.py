@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-from shared.rl.policy import FORWARD_LEFT, Values
+from shared.facts import FORWARD_LEFT
+from shared.rl.policy import Values
 
 MOST_TURNING_RAD = math.radians(720.0)
 """A robot that finds no way out after two full turns drives on regardless (E33)."""

@@ -12,8 +12,9 @@ from PIL import Image
 
 from services.robot_driver.real.link import Battery
 from services.robot_driver.robot import Pose
+from shared.facts import IMAGE_HEIGHT, IMAGE_WIDTH
 from shared.messages import ImageArray
-from shared.rl.preprocess import HEIGHT, WIDTH, preprocess
+from shared.rl.preprocess import preprocess
 
 MAX_JSON_BYTES = 16 * 1024
 MAX_JPEG_BYTES = 4 * 1024 * 1024
@@ -80,7 +81,9 @@ def camera(body: bytes) -> ImageArray:
         raise BadReply("truncated")
     try:
         with Image.open(io.BytesIO(body), formats=["JPEG"]) as picture:
-            if width >= 4 * WIDTH and height >= 4 * HEIGHT:  # decoding half as large is quicker
+            if (
+                width >= 4 * IMAGE_WIDTH and height >= 4 * IMAGE_HEIGHT
+            ):  # decoding half as large is quicker
                 picture.draft("RGB", (width // 2, height // 2))
             return preprocess(np.asarray(picture.convert("RGB"), np.uint8))
     except (OSError, SyntaxError, ValueError) as error:  # what Pillow says of broken files

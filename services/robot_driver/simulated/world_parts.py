@@ -12,8 +12,10 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from shared.facts import NAME
+
 Floats = npt.NDArray[np.float64]
-Text = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,40}$")]
+Text = Annotated[str, Field(pattern=NAME.pattern)]
 Length = Annotated[float, Field(gt=0.0, le=100.0)]
 Side = Annotated[float, Field(ge=0.01, le=100.0)]
 Coordinate = Annotated[float, Field(ge=-1000.0, le=1000.0)]

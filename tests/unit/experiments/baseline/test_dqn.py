@@ -19,7 +19,7 @@ from experiments.records import EVALUATION_COLUMNS, read_csv
 from experiments.report.run_folder import read_info
 from services.robot_driver.robot import Pose
 from shared.config import Config
-from shared.rl.policy import FORWARD, FORWARD_LEFT
+from shared.facts import FORWARD, FORWARD_LEFT
 
 
 class Pretender:

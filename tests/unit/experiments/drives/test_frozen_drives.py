@@ -18,8 +18,8 @@ from experiments.environment import CorridorEnv
 from services.robot_driver.robot import Pose
 from services.robot_driver.simulated.world import WORLDS, World, load_world
 from shared.config import Config
+from shared.facts import FORWARD_LEFT
 from shared.messages import Observation
-from shared.rl.policy import FORWARD_LEFT
 
 RADIUS_M = Config().robot.radius_m
 NAMES = sorted(path.stem for path in WORLDS.glob("*.toml"))

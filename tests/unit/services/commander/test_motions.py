@@ -20,9 +20,9 @@ from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import load_world
 from shared.config import Config
 from shared.errors import RobotTaken
+from shared.facts import FORWARD_LEFT
 from shared.keys import Peer
 from shared.messages import Action, Motion, Observation
-from shared.rl.policy import FORWARD_LEFT
 from shared.rl.spot_turns import SpotTurns
 
 FAST = settings(deadline=None, max_examples=60, derandomize=True)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shared.messages import IMAGE_SHAPE
+from shared.facts import IMAGE_SHAPE
 from shared.rl.preprocess import PREPROCESS_VERSION, preprocess
 
 HALF = Fraction(1, 2)
