@@ -75,220 +75,68 @@ def ident_in(stream: Stream, key: str) -> str | None:
 NEWEST = "newer replaces unread older"
 BUSY = "error reply 'busy', the asker repeats"
 
-OBSERVATION = Stream(
-    "observation",
-    "{run}/robot/{id}/observation",
-    "latest",
-    m.Observation,
-    (),
-    "robot_driver",
-    "actor, monitor",
-    "one per action",
-    8 * KIB,
-    1,
-    NEWEST,
-)
-ACTION = Stream(
-    "action",
-    "{run}/actor/{id}/action",
-    "latest",
-    m.Action,
-    (),
-    "actor",
-    "robot_driver, monitor",
-    "one per observation",
-    2 * KIB,
-    1,
-    NEWEST,
-)
-ROBOT_STATE = Stream(
-    "robot_state",
-    "{run}/robot/{id}/state",
-    "latest",
-    m.RobotState,
-    (),
-    "robot_driver",
-    "monitor",
-    "1 Hz",
-    4 * KIB,
-    1,
-    NEWEST,
-)
-ROBOT_COMMAND = Stream(
-    "robot_command",
-    "{run}/robot/{id}/command",
-    "request",
-    m.RobotCommand,
-    (m.RobotState,),
-    "anyone",
-    "robot_driver",
-    "rare",
-    1 * KIB,
-    16,
-    BUSY,
-)
-ROBOT_WORLD = Stream(
-    "robot_world",
-    "{run}/robot/{id}/world",
-    "request",
-    m.WorldChange,
-    (m.WorldChanged,),
-    "anyone",
-    "robot_driver",
-    "rare",
-    1 * KIB,
-    16,
-    BUSY,
-)
-ACTOR_STATE = Stream(
-    "actor_state",
-    "{run}/actor/{id}/state",
-    "latest",
-    m.ActorState,
-    (),
-    "actor",
-    "monitor",
-    "1 Hz",
-    4 * KIB,
-    1,
-    NEWEST,
-)
-EPISODE = Stream(
-    "episode",
-    "{run}/replay/main/episode",
-    "request",
-    m.Episode,
-    (m.EpisodeAck,),
-    "actor",
-    "replay",
-    "one per episode",
-    24 * MIB,
-    16,
-    BUSY,
-)
-PROGRESS = Stream(
-    "progress",
-    "{run}/replay/main/progress",
-    "request",
-    m.ProgressRequest,
-    (m.RobotProgress,),
-    "actor",
-    "replay",
-    "at start",
-    1 * KIB,
-    16,
-    BUSY,
-)
-REPLAY_STATE = Stream(
-    "replay_state",
-    "{run}/replay/main/state",
-    "latest",
-    m.ReplayState,
-    (),
-    "replay",
-    "learner, actor, monitor",
-    "1 Hz and at every turn",
-    4 * KIB,
-    1,
-    NEWEST,
-)
-TURNS = Stream(
-    "turns",
-    "{run}/replay/main/turns",
-    "request",
-    m.TurnsRequest,
-    (m.Turns,),
-    "learner",
-    "replay",
-    "one per turn",
-    1 * KIB,
-    16,
-    BUSY,
-)
-CHANGES = Stream(
-    "changes",
-    "{run}/replay/main/changes",
-    "request",
-    m.ChangesRequest,
-    (m.Change, m.FeedEnd),
-    "learner",
-    "replay",
-    "one per turn",
-    1 * KIB,
-    4,
-    BUSY,
-)
-SNAPSHOT = Stream(
-    "snapshot",
-    "{run}/replay/main/snapshot",
-    "request",
-    m.SnapshotRequest,
-    (m.Change, m.FeedEnd),
-    "learner",
-    "replay",
-    "at start and after a gap",
-    1 * KIB,
-    4,
-    BUSY,
-)
-MINI_BATCH = Stream(
-    "mini_batch",
-    "{run}/replay/main/mini_batch",
-    "request",
-    m.MiniBatchRequest,
-    (m.Change,),
-    "a foreign learner",
-    "replay",
-    "as it likes",
-    1 * KIB,
-    4,
-    BUSY,
-)
-LEARNER_STATE = Stream(
-    "learner_state",
-    "{run}/learner/main/state",
-    "latest",
-    m.LearnerState,
-    (),
-    "learner",
-    "actor, replay, monitor",
-    "1 Hz, 4 Hz while training, and at every turn done",
-    4 * KIB,
-    1,
-    NEWEST,
-)
-WEIGHTS = Stream(
-    "weights",
-    "{run}/learner/main/weights",
-    "request",
-    m.WeightsRequest,
-    (m.Weights,),
-    "actor, replay, anyone",
-    "learner",
-    "one per version",
-    1 * KIB,
-    16,
-    BUSY,
-)
-SERVICE = Stream(
-    "service",
-    "{run}/service/{id}/command",
-    "request",
-    m.ServiceCommand,
-    (m.ServiceReply,),
-    "anyone",
-    "every service",
-    "rare",
-    1 * KIB,
-    16,
-    BUSY,
-)
+
+def _latest(
+    name: str,
+    pattern: str,
+    message: type[m.Message],
+    sender: str,
+    receiver: str,
+    rate: str,
+    max_bytes: int,
+) -> Stream:
+    """A row of the first table below."""
+    return Stream(
+        name, pattern, "latest", message, (), sender, receiver, rate, max_bytes, 1, NEWEST
+    )
+
+
+def _request(
+    name: str,
+    pattern: str,
+    request: type[m.Message],
+    reply: tuple[type[m.Message], ...],
+    sender: str,
+    receiver: str,
+    rate: str,
+    max_bytes: int,
+    queue: int,
+) -> Stream:
+    """A row of the second table below."""
+    return Stream(
+        name, pattern, "request", request, reply, sender, receiver, rate, max_bytes, queue, BUSY
+    )
+
+
+# fmt: off
+# Published: the receiver holds the newest of each key.
+#                       name             key                             message         from            to                         rate                                                 at most
+OBSERVATION   = _latest("observation",   "{run}/robot/{id}/observation", m.Observation,  "robot_driver", "actor, monitor",          "one per action",                                    8 * KIB)
+ACTION        = _latest("action",        "{run}/actor/{id}/action",      m.Action,       "actor",        "robot_driver, monitor",   "one per observation",                               2 * KIB)
+ROBOT_STATE   = _latest("robot_state",   "{run}/robot/{id}/state",       m.RobotState,   "robot_driver", "monitor",                 "1 Hz",                                              4 * KIB)
+ACTOR_STATE   = _latest("actor_state",   "{run}/actor/{id}/state",       m.ActorState,   "actor",        "monitor",                 "1 Hz",                                              4 * KIB)
+REPLAY_STATE  = _latest("replay_state",  "{run}/replay/main/state",      m.ReplayState,  "replay",       "learner, actor, monitor", "1 Hz and at every turn",                            4 * KIB)
+LEARNER_STATE = _latest("learner_state", "{run}/learner/main/state",     m.LearnerState, "learner",      "actor, replay, monitor",  "1 Hz, 4 Hz while training, and at every turn done", 4 * KIB)
+
+# Asked for and answered.
+#                        name             key                             request             answers                from (asks)              to (answers)     rate                        at most   queue
+ROBOT_COMMAND = _request("robot_command", "{run}/robot/{id}/command",     m.RobotCommand,     (m.RobotState,),       "anyone",                "robot_driver",  "rare",                     1 * KIB,  16)
+ROBOT_WORLD   = _request("robot_world",   "{run}/robot/{id}/world",       m.WorldChange,      (m.WorldChanged,),     "anyone",                "robot_driver",  "rare",                     1 * KIB,  16)
+EPISODE       = _request("episode",       "{run}/replay/main/episode",    m.Episode,          (m.EpisodeAck,),       "actor",                 "replay",        "one per episode",          24 * MIB, 16)
+PROGRESS      = _request("progress",      "{run}/replay/main/progress",   m.ProgressRequest,  (m.RobotProgress,),    "actor",                 "replay",        "at start",                 1 * KIB,  16)
+TURNS         = _request("turns",         "{run}/replay/main/turns",      m.TurnsRequest,     (m.Turns,),            "learner",               "replay",        "one per turn",             1 * KIB,  16)
+CHANGES       = _request("changes",       "{run}/replay/main/changes",    m.ChangesRequest,   (m.Change, m.FeedEnd), "learner",               "replay",        "one per turn",             1 * KIB,  4)
+SNAPSHOT      = _request("snapshot",      "{run}/replay/main/snapshot",   m.SnapshotRequest,  (m.Change, m.FeedEnd), "learner",               "replay",        "at start and after a gap", 1 * KIB,  4)
+MINI_BATCH    = _request("mini_batch",    "{run}/replay/main/mini_batch", m.MiniBatchRequest, (m.Change,),           "a foreign learner",     "replay",        "as it likes",              1 * KIB,  4)
+WEIGHTS       = _request("weights",       "{run}/learner/main/weights",   m.WeightsRequest,   (m.Weights,),          "actor, replay, anyone", "learner",       "one per version",          1 * KIB,  16)
+SERVICE       = _request("service",       "{run}/service/{id}/command",   m.ServiceCommand,   (m.ServiceReply,),     "anyone",                "every service", "rare",                     1 * KIB,  16)
 
 STREAMS: tuple[Stream, ...] = (
     OBSERVATION, ACTION, ROBOT_STATE, ROBOT_COMMAND, ROBOT_WORLD, ACTOR_STATE,
     EPISODE, PROGRESS, REPLAY_STATE, TURNS, CHANGES, SNAPSHOT, MINI_BATCH,
     LEARNER_STATE, WEIGHTS, SERVICE,
-)  # fmt: skip
+)
+# fmt: on
 
 ALIVE_PATTERN = "{run}/alive/{service}/{id}/{life}/{protocol}/{config}"
 """Liveliness token of every service: who is there, which protocol and configuration it speaks."""
