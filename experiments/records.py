@@ -17,7 +17,6 @@ Every column but `seconds` is a function of the configuration, the seed and the 
 from __future__ import annotations
 
 import csv
-import gzip
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -133,7 +132,7 @@ def append_csv(path: Path, columns: tuple[str, ...], rows: Iterable[Row]) -> Non
 
 
 def read_csv(path: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
-    """All rows of a table, also a gzipped one; none where there is no file.
+    """All rows of a table; none where there is no file.
 
     A torn last line is left out.
 
@@ -142,8 +141,7 @@ def read_csv(path: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
     """
     if not path.exists():
         return []
-    opened = gzip.open if path.suffix == ".gz" else open
-    with opened(path, "rt", newline="", encoding="utf-8") as file:
+    with path.open("r", newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
         if tuple(reader.fieldnames or ()) != columns:
             raise ValueError(f"{path}: expected the columns {', '.join(columns)}")

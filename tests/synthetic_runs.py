@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ from experiments.drives import routes
 from experiments.drives.routes import Event
 from experiments.drives.traces import Trace
 from experiments.records import EPISODE_COLUMNS, EVALUATION_COLUMNS, Row, write_csv
+from experiments.report.document import Findings, Missing, Picture, Section
+from experiments.report.run_folder import Experiment, load
 
 FACTOR = 10.0
 AFTER = {"plus-normm-fit": "plus-normm", "plus-minus": "plus-rmm", "i16c": "plus-minus"}
@@ -211,3 +214,25 @@ def _info(experiment: str, shape: Shape, seed: int, episodes: list[Row]) -> dict
         "train_steps": episodes[-1]["train_steps"], "complete": True, "stages": stages,
         "thesis": dict(shape.thesis),
     }  # fmt: skip
+
+
+def experiment(out: Path, name: str, seeds: Sequence[int] = (1,)) -> Experiment:
+    """Made-up runs of one experiment, written and read again."""
+    (found,) = load([write_run(out, name, seed) for seed in seeds])
+    return found
+
+
+def titles(section: Section) -> list[str]:
+    """Titles of the pictures of a section."""
+    return [block.title for block in section.blocks if isinstance(block, Picture)]
+
+
+def missing(section: Section) -> list[str]:
+    """What a section leaves out."""
+    return [block.what for block in section.blocks if isinstance(block, Missing)]
+
+
+def sentences(section: Section) -> str:
+    """The findings of a section, one a line."""
+    told = [block.sentences for block in section.blocks if isinstance(block, Findings)]
+    return "\n".join(sentence for group in told for sentence in group)

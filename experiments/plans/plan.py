@@ -1,21 +1,23 @@
 """Plans: what an experiment of the thesis consists of, as data (A38-A46).
 
 A plan is a TOML file in `plans/`: a configuration (differences to the defaults only), stages that
-change parts of it while the run goes on, and the plan whose end it begins with. `full` has the
-exact constants, computed on a GPU where there is one; `mini` has the same shape, with episodes and
-memories divided by the plan's factors (the counts of the memory follow, E17b), a narrower network,
-and arithmetic that suits it.
+change parts of it while the run goes on, the plan whose end it begins with, and how reports show
+it. `full` has the exact constants, computed on a GPU where there is one; `mini` has the same shape,
+with episodes and memories divided by the plan's factors (the counts of the memory follow, E17b), a
+narrower network, and arithmetic that suits it.
 """
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib import resources
+from importlib.resources.abc import Traversable
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
+from experiments.plans.presentation import INHERITED, Presentation
 from shared.config import Config, Name, PolicyConfig, Section
 from shared.errors import ConfigError
 from shared.settings import preset_tree
@@ -23,6 +25,8 @@ from shared.settings import preset_tree
 Scale = Literal["full", "mini"]
 SCALES: tuple[Scale, ...] = ("full", "mini")
 Tree = dict[str, Any]
+PLANS: Traversable = resources.files("experiments").joinpath("plans")
+"""The folder of all plans."""
 SIZES = (("memory", "capacity"), ("memory", "capacity_max"), ("memory", "capacity_step"))
 """What a smaller scale divides by its `memory_factor`."""
 PERIODS = (("memory", "equalise_every"), ("learning", "fit_every"))
@@ -104,6 +108,8 @@ class Plan(Section):
     """A preset that `config` differs from; empty: the defaults."""
     thesis: dict[str, float] = Field(default_factory=dict)
     """Figures of the thesis, to stand beside ours."""
+    report: Presentation = Presentation()
+    """How reports show it."""
     config: Tree = Field(default_factory=dict)
     stages: Annotated[tuple[Stage, ...], Field(strict=False)] = ()
     tours: Annotated[int, Field(ge=0, le=100)] = 0
@@ -128,25 +134,42 @@ class Plan(Section):
         return self
 
 
-def plan_names() -> list[str]:
-    """Names of all plans."""
-    names = (entry.name for entry in resources.files("experiments").joinpath("plans").iterdir())
+def plan_names(folder: Traversable = PLANS) -> list[str]:
+    """Names of all plans in a folder, sorted."""
+    names = (entry.name for entry in folder.iterdir())
     return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
 
 
-def load_plan(name: str, scale: Scale) -> Plan:
-    """A plan at a scale.
+def load_plan(name: str, scale: Scale, folder: Traversable = PLANS) -> Plan:
+    """The plan of this name at a scale.
 
     Raises:
         ConfigError: There is none of that name, or its file is wrong.
     """
-    return read_plan(name, _text_of(name), scale)
+    return read_plan(name, _text_of(name, folder), scale, folder)
 
 
-def read_plan(name: str, text: str, scale: Scale) -> Plan:
-    """The same from the text of a file. Raises ConfigError."""
+def presentations(names: Iterable[str], folder: Traversable = PLANS) -> dict[str, Presentation]:
+    """How reports show experiments, by name. An experiment without a plan has the defaults.
+
+    Raises:
+        ConfigError: A plan is wrong.
+    """
+    known = plan_names(folder)
+    return {
+        name: load_plan(name, "full", folder).report if name in known else Presentation()
+        for name in names
+    }
+
+
+def read_plan(name: str, text: str, scale: Scale, folder: Traversable = PLANS) -> Plan:
+    """The same from the text of a file; `folder` has the plans it may be `like`.
+
+    Raises:
+        ConfigError: The text is wrong.
+    """
     try:
-        plan = Plan.model_validate({"name": name, **_tree(name, text)})
+        plan = Plan.model_validate({"name": name, **_tree((name,), text, folder)})
     except ValidationError as error:
         raise ConfigError(_one_line(f"plan {name}", error)) from error
     if plan.preset:
@@ -210,26 +233,34 @@ def merged(tree: Tree, over: Mapping[str, Any]) -> Tree:
     return result
 
 
-def _text_of(name: str) -> str:
-    if name not in plan_names():
-        known = ", ".join(plan_names())
-        raise ConfigError(f"experiment: expected one of {known}, got {name!r}")
-    return resources.files("experiments").joinpath("plans", f"{name}.toml").read_text("utf-8")
+def _text_of(name: str, folder: Traversable) -> str:
+    known = plan_names(folder)
+    if name not in known:
+        raise ConfigError(f"experiment: expected one of {', '.join(known)}, got {name!r}")
+    return folder.joinpath(f"{name}.toml").read_text("utf-8")
 
 
-def _tree(name: str, text: str) -> Tree:
-    """The tables of a plan, laid over those of the one it is `like`; lists are replaced."""
+def _tree(names: tuple[str, ...], text: str, folder: Traversable) -> Tree:
+    """The tables of a plan, laid over those of the one it is `like`; lists are replaced.
+
+    Args:
+        names: The plan, after the plans that are like it.
+        text: Its file.
+        folder: All plans.
+    """
     try:
         tree = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"plan {name}: expected TOML: {error}") from error
-    like = tree.pop("like", None)
-    if like is None:
+        raise ConfigError(f"plan {names[-1]}: expected TOML: {error}") from error
+    like = str(tree.pop("like", ""))
+    if not like:
         return tree
-    below = tomllib.loads(_text_of(str(like)))
-    if "like" in below:
-        raise ConfigError(f"plan {name}: like: {like} is itself like {below['like']}")
+    if like in names:
+        raise ConfigError(f"plan {names[0]}: like: {like} is like itself")
+    below = _tree((*names, like), _text_of(like, folder), folder)
     below.pop("thesis", None)  # figures of another experiment
+    report = below.get("report", {})
+    below["report"] = {key: report[key] for key in INHERITED if key in report}
     return merged(below, tree)
 
 

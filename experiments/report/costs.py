@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.resources.abc import Traversable
 
 import numpy as np
 
-from experiments.plans.plan import Plan, load_plan, plan_names, stage_config
-from experiments.report.comparisons import SEARCH
+from experiments.plans.plan import PLANS, Plan, load_plan, plan_names, stage_config
 from experiments.report.document import Block, Missing, Table
 from experiments.report.measures import of_seeds
 from experiments.report.run_folder import Experiment, Run
@@ -24,7 +24,7 @@ class Rates:
     step_s: float
 
     def hours(self, actions: float, steps: float) -> float:
-        """Of so many of both."""
+        """Hours that these numbers of actions and of gradient steps take."""
         return (actions * self.action_s + steps * self.step_s) / 3600.0
 
 
@@ -62,46 +62,54 @@ def rates(runs: Sequence[Run]) -> Rates | None:
     return Rates(float(found[0]), float(found[1]))
 
 
-def full_scale(experiments: Sequence[Experiment], gpu_step_ms: float | None = None) -> Block:
-    """Every plan's cost at full scale: measured where it was run, else projected.
+def full_scale(
+    experiments: Sequence[Experiment],
+    gpu_step_ms: float | None = None,
+    plans: Traversable = PLANS,
+) -> Block:
+    """The cost of every plan at full scale: measured where it was run, else projected.
 
     Args:
         experiments: At any scale. Actions are those of full runs, else those that the thesis
-            tells, else those of mini runs times the plan's factor.
+            gives, else those of mini runs times the plan's factor.
         gpu_step_ms: Measured time of a gradient step on a GPU; adds a column of projected hours.
+        plans: The folder of plans.
     """
     named = {(e.scale, e.name): e for e in experiments}
-    full = [run for e in experiments if e.scale == "full" for run in e.runs]
-    found = rates(full)
+    found = rates([run for e in experiments if e.scale == "full" for run in e.runs])
     if found is None:
         why = "too few runs at full scale to tell actions and gradient steps apart"
         return Missing(TITLE.lower(), why)
     header = ["plan", "actions", "from", "gradient steps", "hours measured", "hours projected"]
+    projections = [found]
     if gpu_step_ms is not None:
         header.append(f"projected with a GPU, {gpu_step_ms:g} ms a step")
-    rows = []
-    for name in plan_names():
-        plan = load_plan(name, "full")
-        if name.startswith(SEARCH) or not plan.stages:
-            continue
-        ours = named.get(("full", name))
-        actions, source = _actions(plan, ours, named.get(("mini", name)))
-        steps = gradient_steps(plan)
-        done = [run.info.seconds for run in ours.runs if run.info.complete] if ours else []
-        row = [
-            name,
-            f"{actions:,.0f}" if source else "-",
-            source or "not known",
-            f"{steps:,}",
-            f"{np.mean(done) / 3600.0:.2f}" if done else "-",
-            f"{found.hours(actions, steps):.1f}" if source else "-",
-        ]
-        if gpu_step_ms is not None:
-            gpu = Rates(found.action_s, gpu_step_ms / 1000.0)
-            row.append(f"{gpu.hours(actions, steps):.1f}" if source else "-")
-        rows.append(tuple(row))
+        projections.append(Rates(found.action_s, gpu_step_ms / 1000.0))
+    every = [load_plan(name, "full", plans) for name in plan_names(plans)]
+    rows = tuple(
+        _row(plan, named.get(("full", plan.name)), named.get(("mini", plan.name)), projections)
+        for plan in every
+        if plan.stages and plan.report.full_scale
+    )
     each = f"{1000 * found.action_s:.1f} ms an action, {found.step_s:.2f} s a gradient step"
-    return Table(f"{TITLE}: {each}", tuple(header), tuple(rows))
+    return Table("full-scale", f"{TITLE}: {each}", tuple(header), rows)
+
+
+def _row(
+    plan: Plan, full: Experiment | None, mini: Experiment | None, projections: Sequence[Rates]
+) -> tuple[str, ...]:
+    actions, source = _actions(plan, full, mini)
+    steps = gradient_steps(plan)
+    done = [run.info.seconds for run in full.runs if run.info.complete] if full else []
+    hours = (f"{rates.hours(actions, steps):.1f}" if source else "-" for rates in projections)
+    return (
+        plan.name,
+        f"{actions:,.0f}" if source else "-",
+        source or "not known",
+        f"{steps:,}",
+        f"{np.mean(done) / 3600.0:.2f}" if done else "-",
+        *hours,
+    )
 
 
 def _actions(plan: Plan, full: Experiment | None, mini: Experiment | None) -> tuple[float, str]:

@@ -34,6 +34,8 @@ class Picture:
 class Table:
     """Rows of text under a header."""
 
+    name: str
+    """Unique in a document."""
     title: str
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
@@ -41,7 +43,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Findings:
-    """Sentences computed from the numbers."""
+    """Sentences computed from the numbers of the figure or table before them."""
 
     sentences: tuple[str, ...]
 
@@ -70,14 +72,15 @@ class Section:
 def write_pictures(sections: Sequence[Section], folder: Path) -> None:
     """Write every picture as `<name>.png`."""
     folder.mkdir(parents=True, exist_ok=True)
-    for picture in pictures(sections):
-        (folder / f"{picture.name}.png").write_bytes(picture.image)
+    for section in sections:
+        for block in section.blocks:
+            if isinstance(block, Picture):
+                (folder / f"{block.name}.png").write_bytes(block.image)
 
 
-def pictures(sections: Sequence[Section]) -> list[Picture]:
-    """All pictures, in order."""
-    blocks = (block for section in sections for block in section.blocks)
-    return [block for block in blocks if isinstance(block, Picture)]
+def sentences(found: Sequence[str]) -> list[Block]:
+    """A block of sentences; none where nothing was found."""
+    return [Findings(tuple(found))] if found else []
 
 
 def markdown(sections: Sequence[Section], images: str, level: int = 2) -> str:
@@ -91,11 +94,12 @@ def markdown(sections: Sequence[Section], images: str, level: int = 2) -> str:
     parts = []
     for section in sections:
         parts.append(f"{'#' * level} {section.title}")
-        parts += [_markdown(block, images) for block in section.blocks]
+        parts += [block_text(block, images) for block in section.blocks]
     return "\n\n".join(parts) + "\n"
 
 
-def _markdown(block: Block, images: str) -> str:
+def block_text(block: Block, images: str) -> str:
+    """One block as Markdown; `images` is the path of the pictures, as seen from the page."""
     match block:
         case Picture():
             caption = f"**{block.title}.** {block.caption}".strip()

@@ -1,19 +1,19 @@
-"""What was seen, as sentences: fixed rules turn numbers into words, also where they contradict.
+"""Sentences about what was seen. Fixed rules turn numbers into words, for and against the thesis.
 
 The thesis shows single runs (E37): "as in the thesis" is about the shape, never about a number.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
 
 from experiments.drives.traces import Trace
+from experiments.plans.presentation import Expected, Presentation
 from experiments.report.figures.drives import Compared
 from experiments.report.figures.progress import curve_of
-from experiments.report.figures.style import ACTIONS
 from experiments.report.measures import (
     Kept,
     evaluated,
@@ -24,26 +24,15 @@ from experiments.report.measures import (
     spread,
 )
 from experiments.report.run_folder import Experiment, Floats, Run
+from shared.facts import SHORT_NAMES
 
 BALANCED = 0.05
-"""Shares of the three actions that differ by at most this are called balanced."""
+"""Shares of the actions that differ by at most this are called balanced."""
 MUCH_CIRCLING = 0.2
 COLLAPSE = 0.25
 """A mean fitness below this part of the median of its curve is called a collapse."""
-EXPECTED_BALANCED = {"plus-normm": False, "plus-rmm": True}
-"""Fig 4.6, Fig 4.11."""
-EXPECTED_FEWER_BUMPS = {
-    ("plus-rmm", "plus-normm"),
-    ("plus-rmm", "plus-normm-fit"),
-    ("plus-rmm-nopretrain", "plus-normm-fit"),
-    ("plus-rmm-nopretrain", "plus-normm-fit-alone"),
-    ("plus-minus", "plus-minus-normm"),
-}
-"""Which of two the thesis holds for the better one (4.3.2)."""
-
-
 ENOUGH_SEEDS = 8
-"""Fewer of either make bootstrap intervals far too narrow (`tests/unit/test_statistics.py`)."""
+"""With fewer seeds of either experiment, bootstrap intervals are far too narrow."""
 
 
 def _verdict(same: bool) -> str:
@@ -63,7 +52,7 @@ def completeness(experiment: Experiment) -> list[str]:
 
 
 def fitness(experiment: Experiment) -> list[str]:
-    """The highest point of the curve, beside the thesis where it tells one."""
+    """The highest point of the curve, beside that of the thesis where it gives one."""
     values = of_seeds(experiment, max_mean_fitness)
     if not len(values):
         return ["Too few episodes for a point of the fitness curve."]
@@ -100,11 +89,11 @@ def same_start(experiments: Sequence[Experiment]) -> list[str]:
     differ = [str(seed) for seed, prefills in sorted(fills.items()) if len(prefills) > 1]
     if differ:
         return [f"The memories did not begin equal in seed {', '.join(differ)}."]
-    return ["Of every seed, the memory began equal in all of them."] if fills else []
+    return ["The memories of each seed began equal in all experiments."] if fills else []
 
 
-def loss(experiment: Experiment) -> list[str]:
-    """Loss before and after the first fitting phase, or at first and at last without one."""
+def loss(experiment: Experiment, shown: Presentation) -> list[str]:
+    """Loss before and after the first fitting phase; without one, at the beginning and the end."""
     sides = [side for run in experiment.runs if (side := _loss_sides(run)) is not None]
     if not sides:
         return []
@@ -114,8 +103,9 @@ def loss(experiment: Experiment) -> list[str]:
     when = "from before to after the first fitting phase" if fits else "from first to last"
     told = f"The mean loss went {when} from {spread(before)} to {spread(after)}: it "
     told += "fell" if ratio < 1.0 else "did not fall"
-    if experiment.name == "plus-rmm":
-        told += f", {_verdict(ratio < 1.0)} (Fig 4.9b)"
+    if (falls := shown.expected.loss_falls) is not None:
+        figure = shown.figures.get("loss")
+        told += f", {_verdict((ratio < 1.0) == falls)}" + (f" ({figure})" if figure else "")
     return [told + "."]
 
 
@@ -130,36 +120,37 @@ def _loss_sides(run: Run) -> tuple[float, float] | None:
     return float(before[-1]), float(np.median(after))
 
 
-def memory(experiment: Experiment) -> list[str]:
+def memory(experiment: Experiment, expected: Expected) -> list[str]:
     """Shares of the actions at the end, and whether they are balanced in most seeds."""
-    shares = {name: of_seeds(experiment, partial(_share, name)) for name in ACTIONS}
-    if not len(shares["forward"]):
+    shares = {name: of_seeds(experiment, partial(_share, name)) for name in SHORT_NAMES}
+    if not len(shares[SHORT_NAMES[0]]):
         return []
     middles = [float(np.median(values)) for values in shares.values()]
     together = np.stack(list(shares.values()))
     spans = np.ptp(together, axis=0)
     balanced = float(np.median(spans)) <= BALANCED
     told = ", ".join(
-        f"{name} {100 * middle:.1f} %" for name, middle in zip(ACTIONS, middles, strict=True)
+        f"{name} {100 * middle:.1f} %" for name, middle in zip(SHORT_NAMES, middles, strict=True)
     )
     word = "balanced" if balanced else "not balanced"
-    expected = EXPECTED_BALANCED.get(experiment.name)
-    end = "" if expected is None else f", {_verdict(expected == balanced)}"
+    thesis = expected.balanced
+    end = "" if thesis is None else f", {_verdict(thesis == balanced)}"
     when = "At the end" if all(run.info.complete for run in experiment.runs) else "So far"
     seeds = f"{np.count_nonzero(spans <= BALANCED)} of {len(spans)} seeds"
     return [
-        f"{when} the memory held {told} (medians of the seeds): {word}{end}; balanced in {seeds}."
+        f"{when} the memory held {told} (medians of the seeds). It was {word}{end}; it was "
+        f"balanced in {seeds}."
     ]
 
 
 def _share(action: str, run: Run) -> float:
-    counts = {name: run.episodes.numbers(name)[-1:] for name in ACTIONS}
+    counts = {name: run.episodes.numbers(name)[-1:] for name in SHORT_NAMES}
     total = sum(float(values.sum()) for values in counts.values())
     return float(counts[action][0]) / total if total else float("nan")
 
 
-def worlds_in_memory(experiment: Experiment) -> list[str]:
-    """Samples per corridor at the end; after Plus-Minus the thesis has more of Minus (Fig 4.15)."""
+def worlds_in_memory(experiment: Experiment, expected: Expected) -> list[str]:
+    """Samples per corridor at the end, and whether one has more than another, as expected."""
     names = sorted({name for run in experiment.runs for name in run.samples_by_world})
     if len(names) < 2:
         return []
@@ -168,15 +159,16 @@ def worlds_in_memory(experiment: Experiment) -> list[str]:
         for name in names
     }
     told = f"Samples at the end: {'; '.join(f'{n} {spread(v)}' for n, v in last.items())}"
-    if experiment.name == "plus-minus" and {"plus", "minus"} <= last.keys():
-        more = bool(np.median(last["minus"]) > np.median(last["plus"]))
-        word = "more" if more else "not more"
-        told += f": {word} of Minus than of Plus, {_verdict(more)}"
+    if expected.more_samples_of and {*expected.more_samples_of} <= last.keys():
+        many, few = expected.more_samples_of
+        more = bool(np.median(last[many]) > np.median(last[few]))
+        told += f". It held {'more' if more else 'not more'} of {many} than of {few}, "
+        told += _verdict(more)
     return [told + "."]
 
 
 def evaluation(experiment: Experiment, world: str) -> list[str]:
-    """The newest drive of the frozen network beside floor and ceiling, circling told aloud."""
+    """The newest drive of the frozen network beside floor and ceiling, and much circling."""
     bumps = of_seeds(experiment, evaluated("bumps_per_1000", world))
     if not len(bumps):
         return []
@@ -195,43 +187,42 @@ def evaluation(experiment: Experiment, world: str) -> list[str]:
     much = int(np.sum(circling > MUCH_CIRCLING))
     if much:
         sentences.append(
-            f"Mind the circling in {world}, {spread(100 * circling)} % of the time: {much} of "
-            f"{len(circling)} seeds circle more than {100 * MUCH_CIRCLING:.0f} % of it, so few "
-            "bumps or a high fitness do not mean that they get anywhere."
+            f"Mind the circling in {world}: the robot circles {spread(100 * circling)} % of the "
+            f"time, and {much} of {len(circling)} seeds circle more than "
+            f"{100 * MUCH_CIRCLING:.0f} % of it. Few bumps or a high fitness do not mean that "
+            "these get anywhere."
         )
     return sentences
 
 
-def difference(pair: Compared) -> str:
-    """Who had fewer bumps, whether the interval excludes 0, and what the thesis expects."""
+def difference(pair: Compared, better: str | None) -> str:
+    """Who had fewer bumps, whether the interval excludes 0, and what the thesis expects.
+
+    Args:
+        pair: The two experiments.
+        better: The one that the thesis holds for the better one, if it says so.
+    """
     d = pair.difference
     fewer, other = (pair.ours, pair.theirs) if d.mean <= 0 else (pair.theirs, pair.ours)
-    told = f"{fewer} had fewer bumps than {other} in {pair.world}: "
+    told = f"{fewer} had fewer bumps than {other} in {pair.world}, by {number(abs(d.mean))} per "
+    told += "1,000 actions."
     if d.mean == 0:
-        told = f"{fewer} and {other} had equally many bumps in {pair.world}: "
-    told += f"{number(abs(d.mean))} per 1,000 actions; the interval of {pair.ours} − {pair.theirs} "
-    told += f"is {number(d.low)} to {number(d.high)} ({pair.seeds[0]} and {pair.seeds[1]} seeds), "
+        told = f"{fewer} and {other} had equally many bumps in {pair.world}."
+    told += f" The interval of {pair.ours} − {pair.theirs} is {number(d.low)} to {number(d.high)} "
+    told += f"({pair.seeds[0]} and {pair.seeds[1]} seeds)"
     few = min(pair.seeds) < ENOUGH_SEEDS
-    told += "which excludes 0" if d.sure else "which includes 0: undecided"
+    told += " and excludes 0." if d.sure else " and includes 0: it is undecided which is better."
     if d.sure and few:
-        told += ", a hint only: of so few seeds many do by chance"
-    better = _expected_better(pair.ours, pair.theirs)
-    if better is not None and d.sure and not few:
-        told += f"; the thesis holds {better} for the better one: "
-        told += "so it is here" if better == fewer else "here it is not"
-    elif better is not None:
-        told += f"; the thesis holds {better} for the better one"
-    return told + "."
-
-
-def _expected_better(ours: str, theirs: str) -> str | None:
-    if (ours, theirs) in EXPECTED_FEWER_BUMPS:
-        return ours
-    return theirs if (theirs, ours) in EXPECTED_FEWER_BUMPS else None
+        told += " With so few seeds this is a hint only."
+    if better is not None:
+        told += f" The thesis holds {better} for the better one"
+        agrees = "so it is here" if better == fewer else "here it is not"
+        told += f"; {agrees}." if d.sure and not few else "."
+    return told
 
 
 def drive(trace: Trace, *, of_thesis: bool) -> str:
-    """How long a drive was and how often it bumped; in the thesis's test it did not (Fig 4.20)."""
+    """How long a drive was and how often it bumped; the drive of the thesis did not bump."""
     bumps = int(trace.bumps.sum())
     told = f"{len(trace.bumps)} actions, {bumps} bump{'' if bumps == 1 else 's'}"
     return f"{told}, {_verdict(bumps == 0)}." if of_thesis else f"{told}."
@@ -248,26 +239,37 @@ def tours(experiment: Experiment) -> list[str]:
         sentence = f"Seed {run.info.seed}: {passed} of {len(run.tours)} test drives were full and "
         sentence += "without a bump"
         sentence += f", {clean} more without a bump but not full" if clean else ""
-        told.append(f"{sentence}; the only one that the thesis tells of was both.")
+        told.append(f"{sentence}. The thesis tells of one drive, which was both.")
     return told
 
 
-def policies(experiments: Sequence[Experiment]) -> list[str]:
-    """Whether every eps-greedy policy got farther than every roulette (Fig 4.2)."""
+def fitness_order(
+    experiments: Sequence[Experiment], shown: Mapping[str, Presentation]
+) -> list[str]:
+    """Highest mean fitness of each, and whether those lead that lead in the thesis."""
     best = {e.name: of_seeds(e, max_mean_fitness) for e in experiments}
-    middles = {name: float(np.median(values)) for name, values in best.items() if len(values)}
-    greedy = [value for name, value in middles.items() if "eps-greedy" in name]
-    rest = [value for name, value in middles.items() if "eps-greedy" not in name]
-    if not greedy or not rest:
+    if not all(len(values) for values in best.values()):
         return []
-    above = min(greedy) > max(rest)
-    told = "Every policy that is greedy most of the time got" if above else "Not every policy that"
-    told += " farther" if above else " is greedy most of the time got farther"
-    return [f"{told} than roulette alone, {_verdict(above)}."]
+    told = "; ".join(f"{name} {spread(values)}" for name, values in best.items())
+    sentences = [f"Highest mean fitness: {told}."]
+    middles = {name: float(np.median(values)) for name, values in best.items()}
+    for name in middles:
+        lower = [other for other in shown[name].expected.fitness_above if other in middles]
+        if lower:
+            above = middles[name] > max(middles[other] for other in lower)
+            word = "is" if above else "is not"
+            sentences.append(
+                f"The median of {name} {word} above that of {' and of '.join(lower)}, "
+                f"{_verdict(above)}."
+            )
+    return sentences
 
 
-def continued(before: Experiment, after: Experiment) -> list[str]:
-    """Whether fitting phases raised the fitness, and whether it collapsed (A40)."""
+def continued(before: Experiment, after: Experiment, *, of_thesis: bool) -> list[str]:
+    """Whether the fitness rose where a run goes on from another, and whether it collapsed (A40).
+
+    In the thesis it rose and never collapsed; `of_thesis` tells whether that is compared.
+    """
     old = _pooled(before)
     new = _pooled(after)
     if not len(old) or not len(new):
@@ -275,12 +277,11 @@ def continued(before: Experiment, after: Experiment) -> list[str]:
     late, middle = float(np.mean(old[-max(1, len(old) // 4) :])), float(np.mean(new))
     rose = middle > late
     fell = float(new.min()) < COLLAPSE * float(np.median(new))
+    ends = [f", {_verdict(holds)}." if of_thesis else "." for holds in (rose, not fell)]
     return [
         f"The mean fitness went from {number(late)} (last quarter of {before.name}) to "
-        f"{number(middle)} ({after.name}): it {'rose' if rose else 'did not rise'}, "
-        f"{_verdict(rose)}.",
-        f"The curve {'collapsed at least once' if fell else 'never collapsed'}, "
-        f"{_verdict(not fell)}.",
+        f"{number(middle)} ({after.name}): it {'rose' if rose else 'did not rise'}{ends[0]}",
+        f"The curve {'collapsed at least once' if fell else 'never collapsed'}{ends[1]}",
     ]
 
 
@@ -292,21 +293,11 @@ def _pooled(experiment: Experiment) -> Floats:
     return means
 
 
-def fitted(rmm: Sequence[Experiment], normm: Experiment) -> list[str]:
-    """Highest fitness of RMM with fits beside NoRMM with fits (Fig 4.12)."""
-    all_of = [*rmm, normm]
-    best = {e.name: of_seeds(e, max_mean_fitness) for e in all_of}
-    if not all(len(values) for values in best.values()):
-        return []
-    told = "; ".join(f"{name} {spread(values)}" for name, values in best.items())
-    above = min(float(np.median(best[e.name])) for e in rmm) > float(np.median(best[normm.name]))
-    word = "every RMM run's is above NoRMM's" if above else "not every RMM run's is above NoRMM's"
-    return [f"Highest mean fitness: {told}. Of the medians {word}, {_verdict(above)}."]
-
-
 def kept_share(found: Sequence[Kept], world: str) -> list[str]:
     """How much of a corridor is left after learning another one."""
     shares = np.array([entry.share for entry in found])
-    word = "it kept at least half" if float(np.median(shares)) >= 0.5 else "it lost more than half"
-    left = f"{spread(100 * shares)} %"
-    return [f"Of its mean way without a bump in {world}, {left} was left: {word}."]
+    word = "at least half" if float(np.median(shares)) >= 0.5 else "less than half"
+    return [
+        f"The network kept {spread(100 * shares)} % of its mean way without a bump in {world}, "
+        f"{word}."
+    ]

@@ -1,7 +1,6 @@
 """Runs of experiments as they lie on disk (`experiments/records.py`), read and checked.
 
-One folder per seed; seeds of one experiment at one scale belong together. Kept folders of
-`docs/results/`, with a gzipped table of episodes, are read alike.
+One folder per seed; seeds of one experiment at one scale belong together.
 """
 
 from __future__ import annotations
@@ -286,12 +285,10 @@ def _seed_folders(folders: Iterable[Path]) -> list[Path]:
 def read_run(folder: Path) -> Run:
     """Read one seed. Raises StateError naming the file that is not what it should be."""
     info = read_info(folder / "run.json")
-    kept = folder / "episodes.csv.gz"
-    episodes = kept if kept.exists() else folder / "episodes.csv"
     return Run(
         folder,
         info,
-        _table(episodes, EPISODE_COLUMNS),
+        _table(folder / "episodes.csv", EPISODE_COLUMNS),
         _table(folder / "evaluations.csv", EVALUATION_COLUMNS),
         tuple(_probes(path) for path in sorted(folder.glob("probes-*.npz"))),
         {

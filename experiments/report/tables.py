@@ -7,7 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from experiments.report.document import Table
-from experiments.report.measures import evaluated, number, of_seeds, spread
+from experiments.report.measures import (
+    MISSING,
+    evaluated,
+    max_mean_fitness,
+    number,
+    of_seeds,
+    spread,
+)
 from experiments.report.run_folder import Experiment, Run
 
 FIGURES = {
@@ -37,7 +44,8 @@ def frozen(experiment: Experiment, world: str) -> Table:
         if drove:
             rows.append((shown, *("-" for _ in lap), *_figures(drove[-1], world, driver)))
     title = f"Frozen in {world}, newest drives of every seed"
-    return Table(title, ("", *lap, *FIGURES.values()), tuple(rows))
+    name = f"{experiment.full_name}-frozen-{world}"
+    return Table(name, title, ("", *lap, *FIGURES.values()), tuple(rows))
 
 
 def _first_lap(run: Run, timed: bool) -> tuple[str, ...]:
@@ -51,21 +59,51 @@ def _figures(run: Run, world: str, driver: str) -> tuple[str, ...]:
     return tuple(number(evaluated(column, world, driver)(run)) for column in FIGURES)
 
 
-def search(experiments: Sequence[Experiment]) -> Table:
-    """Variants of the demo: how soon each seed drove a lap frozen, and how well all drove then."""
+def fitness(experiments: Sequence[Experiment], scale: str, figure: str) -> Table:
+    """Highest mean fitness beside that of the thesis, and frozen drives beside the fitness.
+
+    Circling is shown because fitness takes it for driving. `figure` is the thesis's.
+    """
+    window = experiments[0].runs[0].window
+    shown = f" ({figure})" if figure else ""
+    title = f"Highest mean fitness of {window} episodes{shown}"
+    header = (
+        "variant", "episodes", "thesis (100 episodes)", "ours", "frozen: bumps per 1,000",
+        "frozen: distance", "frozen: circling", "seeds",
+    )  # fmt: skip
+    rows = tuple(
+        (
+            experiment.first.title,
+            number(len(experiment.runs[0].episodes)),
+            number(float(experiment.first.thesis.get("fitness", MISSING))),
+            spread(of_seeds(experiment, max_mean_fitness)),
+            *(
+                spread(of_seeds(experiment, evaluated(name, experiment.first.stages[0].world)))
+                for name in ("bumps_per_1000", "distance", "circling")
+            ),
+            str(len(experiment.runs)),
+        )
+        for experiment in experiments
+    )
+    return Table(f"{scale}-fitness", title, header, rows)
+
+
+def first_laps(experiments: Sequence[Experiment], scale: str) -> Table:
+    """How soon each seed of each variant drove a lap frozen, and how well all drove in the end."""
     header = (
         "variant", "plan", "seeds", "drove a lap", "first lap after actions", "after s",
         "bumps per 1,000", "distance", "s in all",
     )  # fmt: skip
-    return Table("Variants of the demo (seeds of the search)", header,
-                 tuple(_variant(experiment) for experiment in experiments))  # fmt: skip
+    title = f"Variants of {experiments[0].first.title}"
+    rows = tuple(_variant(experiment) for experiment in experiments)
+    return Table(f"{scale}-first-laps", title, header, rows)
 
 
 def _variant(experiment: Experiment) -> tuple[str, ...]:
     laps = [run.info.first_lap for run in experiment.runs if run.info.first_lap]
     soonest = (spread(np.array([lap[name] for lap in laps])) for name in ("actions", "seconds"))
     figures = (
-        spread(of_seeds(experiment, evaluated(name, "plus")))
+        spread(of_seeds(experiment, evaluated(name, experiment.first.stages[0].world)))
         for name in ("bumps_per_1000", "distance")
     )
     return (
@@ -79,7 +117,7 @@ def _variant(experiment: Experiment) -> tuple[str, ...]:
     )
 
 
-def memories(experiments: Sequence[Experiment]) -> Table:
+def memories(experiments: Sequence[Experiment], scale: str) -> Table:
     """What memories held in the end, and how many actions were taken for each of their places."""
     header = (
         "experiment", "seeds", "actions for each place", "left of the filling, %",
@@ -103,7 +141,7 @@ def memories(experiments: Sequence[Experiment]) -> Table:
         )
         seeds = ", ".join(str(run.info.seed) for run, _ in told)
         rows.append((experiment.name, seeds, *(spread(np.array(each)) for each in figures)))
-    return Table("What the memories held in the end", header, tuple(rows))
+    return Table(f"{scale}-memories", "What the memories held in the end", header, tuple(rows))
 
 
 def test_drives(experiments: Sequence[Experiment]) -> Table:
@@ -124,7 +162,7 @@ def test_drives(experiments: Sequence[Experiment]) -> Table:
         for run in experiment.runs
         if run.tours
     )
-    return Table("Test drives (A45)", header, rows)
+    return Table("test-drives", "Test drives (A45)", header, rows)
 
 
 def tours(experiment: Experiment) -> Table:
@@ -148,7 +186,8 @@ def tours(experiment: Experiment) -> Table:
         for run in experiment.runs
         for place, tour in enumerate(run.tours)
     )
-    return Table("Test drives with turns on the spot (A45)", header, rows)
+    title = "Test drives with turns on the spot (A45)"
+    return Table(f"{experiment.full_name}-tours", title, header, rows)
 
 
 def _yes(holds: bool) -> str:

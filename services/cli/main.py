@@ -300,7 +300,8 @@ def report(
     ] = None,
 ) -> None:
     """Write figures, tables and findings of finished runs as HTML and Markdown."""
-    pages = import_role("experiments.report.pages", "experiments").write(runs, out, gpu_step_ms)
+    report = import_role("experiments.report.full_report", "experiments")
+    pages = report.write_report(runs, out, gpu_step_ms)
     typer.echo(f"written: {pages[0]} and {len(pages) - 1} Markdown pages beside it")
 
 

@@ -9,17 +9,17 @@ from matplotlib.figure import Figure
 
 from experiments.report.figures.style import (
     ACTION_COLOURS,
-    ACTIONS,
     GREY,
     INK,
+    colours,
     draw_band,
     draw_stages,
     sheet,
     styled,
-    world_colour,
 )
 from experiments.report.run_folder import Experiment, Floats, Run
 from experiments.report.statistics import Curve, band_of_blocks
+from shared.facts import ACTION_COUNT, SHORT_NAMES
 
 
 @styled
@@ -27,10 +27,12 @@ def by_action(experiment: Experiment) -> Figure:
     """Samples per action over episodes, and at the end."""
     parts = {
         name: [_thinned(run, run.episodes.numbers(name)) for run in experiment.runs]
-        for name in ACTIONS
+        for name in SHORT_NAMES
     }
-    capacity = [_thinned(run, run.episodes.numbers("capacity") / 3) for run in experiment.runs]
-    return _drawn(experiment, parts, ACTION_COLOURS, capacity)
+    quota = [
+        _thinned(run, run.episodes.numbers("capacity") / ACTION_COUNT) for run in experiment.runs
+    ]
+    return _drawn(experiment, parts, ACTION_COLOURS, quota)
 
 
 @styled
@@ -44,7 +46,7 @@ def by_world(experiment: Experiment) -> Figure:
         ]
         for name in names
     }
-    return _drawn(experiment, parts, {name: world_colour(name) for name in names}, None)
+    return _drawn(experiment, parts, colours(names), None)
 
 
 def _thinned(run: Run, values: Floats) -> Curve:
@@ -60,7 +62,7 @@ def _drawn(
     experiment: Experiment,
     parts: Mapping[str, list[Curve]],
     colour_of: Mapping[str, str],
-    third: list[Curve] | None,
+    quota: list[Curve] | None,
 ) -> Figure:
     figure = sheet(2.8)
     over, end = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True)
@@ -71,9 +73,9 @@ def _drawn(
         spread = [[middle - last.min()], [last.max() - middle]]
         end.bar(i, middle, color=colour_of[name], width=0.7)
         end.errorbar(i, middle, yerr=spread, color=INK, capsize=3, linewidth=1.0)
-    if third is not None:
-        limit = band_of_blocks(third)
-        over.plot(limit.x, limit.median, ":", color=GREY, label="a third of the capacity")
+    if quota is not None:
+        limit = band_of_blocks(quota)
+        over.plot(limit.x, limit.median, ":", color=GREY, label="equal share of the capacity")
         end.axhline(limit.median[-1], linestyle=":", color=GREY)
     draw_stages(over, experiment.runs[0].stages)
     over.set_xlabel("episode")

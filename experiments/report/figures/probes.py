@@ -14,11 +14,12 @@ from matplotlib.patches import Patch
 
 from experiments.report.figures.style import ACTION_COLOURS, GREY, INK, sheet, styled
 from experiments.report.run_folder import Experiment, Floats, Probes
+from shared.facts import ACTION_COUNT, ACTIONS, SHORT_NAMES
 
 COLUMNS = 6
-SHOWN = ("left", "forward", "right")
-"""Bars stand where their action leads."""
-_ORDER = (1, 0, 2)
+ORDER = sorted(range(ACTION_COUNT), key=lambda index: -ACTIONS[index].turn)
+"""Actions as their bars stand: from the farthest left to the farthest right."""
+SHOWN = [SHORT_NAMES[index] for index in ORDER]
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def predictions(probes: Probes, networks: Sequence[Predictions], wanted: int) ->
         for axes, network in zip(cells[1:], networks, strict=True):
             _bars(axes, network.values[indices[cell]], network.title if column == 0 else None)
     handles = [Patch(color=ACTION_COLOURS[name]) for name in SHOWN]
-    figure.legend(handles, SHOWN, loc="outside lower center", ncols=3)
+    figure.legend(handles, SHOWN, loc="outside lower center", ncols=ACTION_COUNT)
     return figure
 
 
@@ -70,11 +71,13 @@ def _image(axes: Axes, image: npt.NDArray[np.uint8], letter: str) -> None:
 
 
 def _bars(axes: Axes, values: Floats, title: str | None) -> None:
-    heights = [float(values[i]) for i in _ORDER]
-    axes.bar(range(3), heights, color=[ACTION_COLOURS[name] for name in SHOWN], width=0.75)
+    heights = [float(values[i]) for i in ORDER]
+    axes.bar(
+        range(ACTION_COUNT), heights, color=[ACTION_COLOURS[name] for name in SHOWN], width=0.75
+    )
     axes.axhline(0.0, color=INK, linewidth=0.7)
     axes.set_ylim(-1.05, 1.05)
-    axes.set_xlim(-0.6, 2.6)
+    axes.set_xlim(-0.6, ACTION_COUNT - 0.4)
     axes.set_xticks([])
     axes.set_yticks([-1, 0, 1], ["−1", "0", "1"] if title is not None else ["", "", ""])
     axes.spines["bottom"].set_visible(False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from functools import wraps
 from itertools import pairwise
 from typing import ParamSpec
@@ -15,6 +15,7 @@ from PIL import Image
 
 from experiments.report.run_folder import Stage
 from experiments.report.statistics import Band
+from shared.facts import SHORT_NAMES
 
 P = ParamSpec("P")
 
@@ -23,19 +24,10 @@ WIDTH_IN = 6.5
 DPI = 130
 INK, GREY, SWITCH = "#222222", "#8a8a8a", "#c1272d"
 GREEN = "#009E73"
-OTHERS = ("#000000", "#7a5195", "#8c564b", "#6b8e23", "#44aa99", "#4d4d9a")
-"""Colours of experiments without one of their own, by the order of their names."""
-EXPERIMENTS = {
-    "plus-normm": "#D55E00",
-    "plus-normm-fit": "#CC79A7",
-    "plus-rmm": "#0072B2",
-    "plus-rmm-nopretrain": "#56B4E9",
-    "plus-minus": "#882255",
-    "i16c": "#E69F00",
-}
-ACTIONS = ("forward", "left", "right")
-ACTION_COLOURS = {"forward": "#0072B2", "left": "#E69F00", "right": "#009E73"}
-WORLD_COLOURS = {"plus": "#0072B2", "minus": "#D55E00", "i16c": "#009E73"}
+PALETTE = (
+    "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000", "#8c564b",
+)  # fmt: skip
+"""Colours of experiments, corridors and actions, in the order in which a figure shows them."""
 _RC = {
     "font.size": 8.5,
     "axes.titlesize": 9.0,
@@ -84,19 +76,16 @@ def png(figure: Figure) -> bytes:
 
 
 def colours(names: Iterable[str]) -> dict[str, str]:
-    """One colour per experiment; they repeat where `told_apart` says no."""
-    rest = sorted(set(names) - set(EXPERIMENTS))
-    return EXPERIMENTS | {name: OTHERS[i % len(OTHERS)] for i, name in enumerate(rest)}
+    """A colour for each name, in their order; colours repeat where `told_apart` says no."""
+    return {name: PALETTE[i % len(PALETTE)] for i, name in enumerate(names)}
 
 
-def told_apart(names: Iterable[str]) -> bool:
-    """Whether there are colours enough for these experiments in one figure."""
-    return len(set(names) - set(EXPERIMENTS)) <= len(OTHERS)
+ACTION_COLOURS = colours(SHORT_NAMES)
 
 
-def world_colour(name: str) -> str:
-    """Colour of a corridor."""
-    return WORLD_COLOURS.get(name, INK)
+def told_apart(names: Collection[str]) -> bool:
+    """Whether there are enough colours for these names in one figure."""
+    return len(names) <= len(PALETTE)
 
 
 def draw_band(axes: Axes, band: Band, colour: str, label: str) -> None:

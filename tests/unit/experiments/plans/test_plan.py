@@ -169,8 +169,11 @@ def test_a_plan_can_say_what_it_is_like() -> None:
     assert (plan.title, plan.after, plan.stages) == ("t", model.after, model.stages)
     assert plan.config["memory"] == {**model.config["memory"], "capacity": 60}
     assert not plan.thesis  # those figures are the other one's
-    with pytest.raises(ConfigError, match="plus-minus-normm is itself like plus-minus"):
-        read_plan("other", 'like = "plus-minus-normm"', "full")
+    twice = read_plan("other", 'like = "plus-minus-normm"\ntitle = "t"', "full")
+    assert twice.config["memory"] == load_plan("plus-minus-normm", "full").config["memory"]
+    assert not twice.thesis
+    with pytest.raises(ConfigError, match="plus-minus is like itself"):
+        read_plan("plus-minus", 'like = "plus-minus-normm"', "full")
 
 
 def test_merging_changes_neither_tree() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from experiments.plans.plan import Plan, load_plan, stage_config
-from experiments.report import costs
+from experiments.report import archives, costs
 from experiments.report.document import Missing, Table
 from experiments.report.results import DOCS
 from experiments.report.run_folder import Experiment, load
@@ -40,7 +40,7 @@ def test_gradient_steps_are_those_of_the_schedule(name: str) -> None:
 
 
 def test_gradient_steps_agree_with_the_runs_that_are_kept() -> None:
-    for experiment in load(sorted((DOCS / "results").glob("*"))):
+    for experiment in archives.load(sorted((DOCS / "results").glob("*.tar.xz"))):
         if not experiment.first.stages or experiment.name.startswith("dqn"):
             continue
         told = costs.gradient_steps(load_plan(experiment.name, experiment.scale))

@@ -10,9 +10,11 @@ from matplotlib.text import Text
 
 from experiments.report.figures import drives, memory, probes, progress
 from experiments.report.figures.drives import Compared
-from experiments.report.figures.style import EXPERIMENTS, OTHERS, colours, png
+from experiments.report.figures.probes import chosen
+from experiments.report.figures.style import ACTION_COLOURS, PALETTE, colours, png, told_apart
 from experiments.report.run_folder import Experiment, Probes, load
 from experiments.report.statistics import Difference, block_means
+from shared.facts import SHORT_NAMES
 from tests.synthetic_runs import write_run
 
 
@@ -126,8 +128,14 @@ def test_equal_figures_are_equal_bytes(found: dict[str, Experiment]) -> None:
     assert first == second
 
 
-def test_an_experiment_keeps_its_colour_in_any_company() -> None:
-    known = colours(["plus-rmm", "x", "y"])
-    assert known["plus-rmm"] == colours(["plus-rmm"])["plus-rmm"] == EXPERIMENTS["plus-rmm"]
-    assert known["x"] != known["y"]
-    assert not set(OTHERS) & set(EXPERIMENTS.values())
+def test_as_many_experiments_as_colours_are_told_apart() -> None:
+    names = [f"plan-{number}" for number in range(len(PALETTE))]
+    assert len({*colours(names).values()}) == len(names)
+    assert told_apart(names)
+    assert not told_apart([*names, "one-more"])
+    assert list(ACTION_COLOURS) == list(SHORT_NAMES)
+
+
+def test_images_shown_are_spread_over_the_set_in_order() -> None:
+    assert chosen(3, 6) == [0, 1, 2]
+    assert chosen(21, 6) == [0, 4, 8, 12, 16, 20]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 from pathlib import Path
 
@@ -34,15 +33,6 @@ def test_seeds_of_an_experiment_come_together_from_any_level(tmp_path: Path) -> 
 def test_the_window_follows_the_scale(tmp_path: Path) -> None:
     for seed, (factor, window) in enumerate([(1.0, 100), (4.0, 25), (50.0, 10)]):
         assert read_run(write_run(tmp_path, NAME, seed, factor=factor)).window == window
-
-
-def test_a_gzipped_table_reads_as_the_plain_one(folder: Path) -> None:
-    plain = read_run(folder).episodes
-    data = (folder / "episodes.csv").read_bytes()
-    (folder / "episodes.csv").unlink()
-    (folder / "episodes.csv.gz").write_bytes(gzip.compress(data))
-    assert read_run(folder).episodes == plain
-    assert len(plain) == 100
 
 
 def test_a_torn_last_line_is_left_out(folder: Path) -> None:

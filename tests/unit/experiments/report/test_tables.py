@@ -10,9 +10,9 @@ import pytest
 
 from experiments.records import EVALUATION_COLUMNS, read_csv, write_csv
 from experiments.report import findings, tables
-from experiments.report.comparisons import compare_all
 from experiments.report.document import Table
-from experiments.report.pages import overview_blocks, section_of
+from experiments.report.full_report import all_sections
+from experiments.report.overview import overview
 from experiments.report.run_folder import load
 from experiments.report.tables import frozen, tours
 from shared.errors import StateError
@@ -70,9 +70,9 @@ def test_variants_of_the_demo_stand_side_by_side(tmp_path: Path) -> None:
     for name, laps in (("search-fast", ({}, {})), ("search-demo", (LAP, {}))):
         for seed, lap in zip((101, 102), laps, strict=True):
             write_run(tmp_path, name, seed, first_lap=lap, seconds=100.0 * seed)
-    (section,) = compare_all(load([tmp_path]))
-    table = next(block for block in section.blocks if isinstance(block, Table))
-    assert table.title.startswith("Variants of the demo")
+    compared = all_sections(load([tmp_path]))[1]
+    table = next(block for block in compared.blocks if isinstance(block, Table))
+    assert table.title.startswith("Variants of Search demo")
     first, second = (dict(zip(table.header, row, strict=True)) for row in table.rows)
     assert first["plan"] == "`search-demo`"
     assert (first["drove a lap"], first["first lap after actions"]) == ("1 of 2", "8,123")
@@ -97,8 +97,8 @@ def test_every_test_drive_has_a_row_and_a_damaged_file_is_named(tmp_path: Path) 
     assert "1 of 3 test drives were full and without a bump, 1 more without a bump but" in told
     (counted,) = tables.test_drives([experiment]).rows
     assert counted == ("i16c-test", "mini", "1", "1 of 3", "2 of 3", "0, 0, 2")
-    assert any(getattr(block, "rows", ()) == (counted,) for block in overview_blocks([experiment]))
-    section = section_of(experiment)
+    assert any(getattr(block, "rows", ()) == (counted,) for block in overview([experiment]).blocks)
+    section = all_sections([experiment])[-1]
     assert any(block == table for block in section.blocks)
     path.write_text('[{"passed": 1}]')
     with pytest.raises(StateError, match=r"tours\.json"):
@@ -112,7 +112,7 @@ def test_memories_are_told_of_where_runs_tell(tmp_path: Path) -> None:
     write_run(tmp_path, "plus-normm", 1)
     (found,) = [e for e in load([tmp_path]) if e.name == "plus-rmm"]
     actions = [run.actions / 4500 for run in found.runs]
-    (row,) = tables.memories(load([tmp_path])).rows
+    (row,) = tables.memories(load([tmp_path]), "mini").rows
     assert row[:2] == ("plus-rmm", "1, 2")
     assert row[2].startswith(f"{np.median(actions):.3g}")
     assert row[3:] == ("50 (25 to 75)", "50 (50 to 50)", "0.125 (0.125 to 0.125)")

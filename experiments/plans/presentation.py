@@ -1,0 +1,87 @@
+"""How reports show an experiment: the table `report` of a plan.
+
+Reports know no experiment by name. What is shown together, what is compared with what, and what
+the thesis lets one expect stands in the plans.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from shared.config import Name, Section
+
+Names = Annotated[tuple[Name, ...], Field(strict=False)]
+
+
+class Expected(Section):
+    """What the thesis says of an experiment. The report tells whether a run agrees."""
+
+    balanced: bool | None = None
+    """Whether the memory holds about equally many samples of all actions at the end."""
+    loss_falls: bool | None = None
+    """Whether the loss is lower after the first fitting phase than before it."""
+    more_samples_of: Names = ()
+    """Two corridors; the memory holds more samples of the first at the end."""
+    fewer_bumps_than: Names = ()
+    """Experiments whose frozen networks bump more often."""
+    fitness_above: Names = ()
+    """Experiments whose highest mean fitness is lower."""
+
+
+class Comparison(Section):
+    """A comparison with other experiments. It is shown where all of them were run."""
+
+    kind: Literal["continued", "fitness", "equal-actions", "predictions", "kept"]
+    """continued: fitness of another experiment and of this one, which goes on from it.
+    fitness: fitness of all, each from its own first episode.
+    equal-actions: bumps beside each other one, after equally many actions of learning.
+    predictions: rewards predicted for the same images by this network and another one.
+    kept: mean way without a bump in `world` before and after learning in other corridors."""
+    others: Names = ()
+    world: Name = "plus"
+    weights: Literal["best", "last"] = "best"
+    """Weights of this experiment that predict; those of the other one are always its best."""
+    figure: str = ""
+    """The figure of the thesis that shows the same, such as "Fig 4.5"."""
+
+    @model_validator(mode="after")
+    def _enough_others(self) -> Self:
+        least, most = _OTHERS[self.kind]
+        if not least <= len(self.others) <= most:
+            raise ValueError(f"others: expected {least} to {most} for {self.kind}")
+        return self
+
+
+_OTHERS = {
+    "continued": (1, 1),
+    "fitness": (1, 7),
+    "equal-actions": (1, 20),
+    "predictions": (1, 1),
+    "kept": (0, 0),
+}
+"""Least and most other experiments by kind of comparison."""
+
+
+class Presentation(Section):
+    """The table `report` of a plan."""
+
+    groups: Names = ("runs",)
+    """Frozen drives are shown together with those of experiments of the same group that learned
+    the same corridors."""
+    reference_of: Names = ()
+    """Groups in which all others are compared with this experiment only."""
+    table: Literal["", "fitness", "first-lap"] = ""
+    """The table that this experiment has a row in."""
+    full_scale: bool = True
+    """Whether the plan is meant for the full scale, and its cost there is told."""
+    figures: dict[str, str] = Field(default_factory=dict)
+    """The figure of the thesis by the kind of ours: fitness, loss, memory, worlds, route, table,
+    `probes-best-<world>`, `probes-last-<world>`."""
+    expected: Expected = Expected()
+    comparisons: Annotated[tuple[Comparison, ...], Field(strict=False)] = ()
+
+
+INHERITED = ("groups", "table", "full_scale")
+"""What a plan takes over from the one that it is `like`; the rest tells of one experiment only."""

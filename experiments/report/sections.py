@@ -1,0 +1,196 @@
+"""The section of one experiment: its figures and tables, and sentences about them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from experiments.drives import routes
+from experiments.plans.presentation import Presentation
+from experiments.report import findings, run_folder, tables
+from experiments.report.document import Block, Findings, Missing, Picture, Section, Table, sentences
+from experiments.report.figures import drives, memory, probes, progress
+from experiments.report.figures.style import stages_text
+from experiments.report.measures import MEASURED, number, of_seeds, spread
+from experiments.report.run_folder import Experiment
+from services.robot_driver.simulated.world import World, WorldError, load_world
+from shared.errors import StateError
+
+PROBES_SHOWN = 12
+
+
+def section_of(experiment: Experiment, shown: Presentation) -> Section:
+    """Figures, tables and sentences of one experiment."""
+    blocks = (
+        Findings(tuple(findings.completeness(experiment))),
+        *_beside_thesis(experiment),
+        *_progress(experiment, shown),
+        *_memory(experiment, shown),
+        *_evaluations(experiment, shown),
+        *_probes(experiment, shown),
+        *_tours(experiment),
+        *_routes(experiment, shown),
+    )
+    title = f"{experiment.first.title} ({experiment.full_name})"
+    return Section(experiment.full_name, title, blocks)
+
+
+def _picturing(
+    experiment: Experiment, shown: Presentation
+) -> Callable[[str, str, str, Callable[[], Figure]], Picture]:
+    """A function from kind, title, caption and drawing to a picture of this experiment."""
+
+    def picture(kind: str, title: str, caption: str, draw: Callable[[], Figure]) -> Picture:
+        theirs = shown.figures.get(kind)
+        name = f"{experiment.full_name}-{kind}"
+        return Picture(name, f"{title} ({theirs})" if theirs else title, caption, draw)
+
+    return picture
+
+
+def _seeds_text(experiment: Experiment) -> str:
+    count = len(experiment.runs)
+    return "One seed." if count == 1 else f"{count} seeds: median, lowest to highest."
+
+
+def _beside_thesis(experiment: Experiment) -> list[Block]:
+    first, thesis = experiment.first, experiment.first.thesis
+    if not thesis:
+        return [Missing("the thesis's numbers", "the thesis gives none for this experiment")]
+    rows = []
+    for name, value in thesis.items():
+        measure = MEASURED.get(name)
+        if measure is None or not isinstance(value, int | float):
+            rows.append((name.replace("_", " "), str(value), "-", "not measured"))
+            continue
+        scaled = number(measure.scaled(value, first))
+        rows.append((measure.text, number(value), scaled, spread(of_seeds(experiment, measure.of))))
+    scale = f"thesis at this scale (episodes 1/{first.factor:g}, memory 1/{first.memory_factor:g})"
+    header = ("", "thesis", scale, "ours")
+    title = "Beside the thesis, whose numbers are those of single runs: shapes count, not digits"
+    return [Table(f"{experiment.full_name}-thesis", title, header, tuple(rows))]
+
+
+def _progress(experiment: Experiment, shown: Presentation) -> list[Block]:
+    window = experiment.runs[0].window
+    if all(len(run.episodes) < window for run in experiment.runs):
+        why = f"every seed has fewer than {window} episodes"
+        return [Missing("fitness and loss over episodes", why)]
+    picture = _picturing(experiment, shown)
+    stages = stages_text(experiment.runs[0].stages)
+    about = f"Fitness, averaged over {window} episodes; green: episodes that reached 500."
+    if window != run_folder.WINDOW:
+        about += f" The thesis averages {run_folder.WINDOW} episodes."
+    caption = f"{about} {_seeds_text(experiment)} {stages}"
+    told = [*findings.fitness(experiment), *findings.first_lap(experiment)]
+    blocks = [
+        picture("fitness", "Fitness", caption, partial(progress.fitness, experiment)),
+        *sentences(told),
+    ]
+    if not any(len(progress.curve_of(run, "loss")[0]) for run in experiment.runs):
+        return [*blocks, Missing("loss over episodes", "nothing was trained")]
+    caption = f"Loss, averaged over {window} episodes. {_seeds_text(experiment)} {stages}"
+    loss = picture("loss", "Loss", caption, partial(progress.loss, experiment))
+    return [*blocks, loss, *sentences(findings.loss(experiment, shown))]
+
+
+def _memory(experiment: Experiment, shown: Presentation) -> list[Block]:
+    if not all(len(run.episodes) for run in experiment.runs):
+        return [Missing("samples in the memory", "a seed has no episodes yet")]
+    picture = _picturing(experiment, shown)
+    caption = f"Samples in the replay memory by action. {_seeds_text(experiment)}"
+    blocks: list[Block] = [
+        picture("memory", "Memory by action", caption, partial(memory.by_action, experiment)),
+        *sentences(findings.memory(experiment, shown.expected)),
+    ]
+    if any(len(run.samples_by_world) > 1 for run in experiment.runs):
+        caption = f"Samples in the replay memory by corridor. {_seeds_text(experiment)}"
+        drawn = partial(memory.by_world, experiment)
+        blocks.append(picture("worlds", "Memory by corridor", caption, drawn))
+        blocks += sentences(findings.worlds_in_memory(experiment, shown.expected))
+    elif theirs := shown.figures.get("worlds"):
+        blocks.append(Missing(f"memory by corridor ({theirs})", "samples of one corridor only"))
+    return blocks
+
+
+def _evaluations(experiment: Experiment, shown: Presentation) -> list[Block]:
+    if not experiment.worlds:
+        return [Missing("drives of the frozen network", "there are none in evaluations.csv")]
+    picture = _picturing(experiment, shown)
+    blocks: list[Block] = []
+    for world in experiment.worlds:
+        caption = (
+            f"Greedy drives of the frozen network in {world}, without learning. "
+            f"{_seeds_text(experiment)} Thin lines: single seeds. Lines across: random actions and "
+            "the planner that knows the map, where they drove."
+        )
+        title = f"Frozen evaluation in {world}"
+        drawn = partial(drives.curves, [experiment], world)
+        blocks.append(picture(f"evaluation-{world}", title, caption, drawn))
+        blocks += sentences(findings.evaluation(experiment, world))
+        blocks.append(tables.frozen(experiment, world))
+    return blocks
+
+
+def _probes(experiment: Experiment, shown: Presentation) -> list[Block]:
+    """What the best and the last weights predict, one figure per corridor."""
+    worlds = sorted({entry.world for run in experiment.runs for entry in run.probes})
+    blocks: list[Block] = []
+    for world in worlds:
+        for weights, choose in (("best", probes.best), ("last", probes.last)):
+            kind = f"probes-{weights}-{world}"
+            choice = choose(experiment, world)
+            if choice is not None:
+                blocks.append(_predictions(experiment, shown, kind, choice))
+            elif theirs := shown.figures.get(kind):
+                blocks.append(Missing(f"predicted rewards ({theirs})", f"there is no {kind} file"))
+    return blocks or [Missing("predicted rewards", "there are no files of probes")]
+
+
+def _predictions(
+    experiment: Experiment, shown: Presentation, kind: str, choice: probes.Choice
+) -> Picture:
+    entry = choice.probes
+    networks = [probes.Predictions("reward", entry.values)]
+    drawn = partial(probes.predictions, entry, networks, PROBES_SHOWN)
+    caption = (
+        f"A fixed set of images of {entry.world}, and the rewards predicted for "
+        f"{', '.join(probes.SHOWN)}, from −1 to 1, by seed {choice.seed}: {choice.weights}."
+    )
+    title = f"Predicted rewards in {entry.world}, {kind.split('-')[1]} weights"
+    return _picturing(experiment, shown)(kind, title, caption, drawn)
+
+
+def _tours(experiment: Experiment) -> list[Block]:
+    told = findings.tours(experiment)
+    return [tables.tours(experiment), *sentences(told)] if told else []
+
+
+def _routes(experiment: Experiment, shown: Presentation) -> list[Block]:
+    theirs = shown.figures.get("route")
+    blocks: list[Block] = []
+    for run in experiment.runs:
+        for label, drive in run.routes.items():
+            name = drive.trace.world
+            events = "; ".join(f"{e.number} (action {e.action}) {e.text}" for e in drive.events)
+            caption = f"Drive {label} of seed {run.info.seed} in {name}: "
+            caption += findings.drive(drive.trace, of_thesis=theirs is not None)
+            caption += f" Numbers: {events}." if events else ""
+            title = f"Route in {name} ({theirs})" if theirs else f"Route in {name}"
+            world = _world(name, run.folder)
+            drawn = partial(routes.figure, world, [drive.trace], title, drive.events)
+            picture = f"{experiment.full_name}-route-{label}-{run.info.seed}"
+            blocks.append(Picture(picture, title, caption, drawn))
+    if not blocks and theirs:
+        return [Missing(f"route ({theirs})", "there is no route file")]
+    return blocks
+
+
+def _world(name: str, folder: Path) -> World:
+    try:
+        return load_world(name)
+    except WorldError as error:
+        raise StateError(f"{folder}: a route is in a world that does not exist: {error}") from error
