@@ -128,7 +128,7 @@ def _classes(annotation: Any) -> Iterator[type[messages.Message]]:
 
 
 def _type(field: FieldInfo) -> str:
-    """Type and range in words, e.g. "int, 0..2" or "bytes, 3750"."""
+    """Type and range in words, e.g. "int, >= 0" or "bytes, length 16"."""
     limits = {}
     for item in field.metadata:
         for name in ("ge", "gt", "le", "lt", "min_length", "max_length", "pattern"):

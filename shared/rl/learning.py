@@ -1,10 +1,11 @@
-"""Training step, fitting phase and target rule (sections 3.4.2, 3.4.3, 3.5.3)."""
+"""What the network learns and when (sections 3.4.2, 3.4.3, 3.5.3): step, fit, target rule.
+
+How a gradient is computed stands in `gradients`; nothing here depends on it.
+"""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -12,11 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from shared.rl import trunk
-from shared.rl.batches import Batches, Mask, Ranks, ResidentBatches, StoredBatches
+from shared.rl.batches import Batches, Mask, Ranks
 from shared.rl.draws import generator
-from shared.rl.engine import arithmetic, scaled
+from shared.rl.engine import arithmetic
 from shared.rl.equalisation import due
+from shared.rl.gradients import Gradients, Losses, MeanOfWeights
 from shared.rl.memory import SampleStore
 from shared.rl.network import QNetwork, initialised
 
@@ -55,15 +56,13 @@ class Trainer:
             alpha=learning.rmsprop_alpha,
             eps=learning.rmsprop_epsilon,
         )
-        self._in_a_share = numerics.model_copy(update={"threads": 1})
-        self._pool = ThreadPoolExecutor(max(1, numerics.threads), "share of a mini-batch")
-        self._mean: list[Tensor] = []
-        self._in_mean = 0
-        """Of the weights after so many steps; begins anew with each epoch and each episode."""
+        self.gradients = Gradients(self.train_network, numerics)
+        self._mean = MeanOfWeights(self.train_network)
+        """It begins anew with each epoch and each episode."""
         self.train_steps = 0
         self.fits = 0
         self.version = 1
-        """Of the target network; 1 is the initial one."""
+        """The version of the target network; 1 is the initial one."""
         self.steps_at_copy = 0
         self.episode_at_copy = 0
 
@@ -78,7 +77,7 @@ class Trainer:
 
         A fitting phase when due, else `mini_batches_per_episode` steps.
         """
-        self._in_mean = 0
+        self._mean.restart()
         if not len(samples):
             return
         if due(episode, self._learning.fit_every):
@@ -98,9 +97,7 @@ class Trainer:
         if self.train_steps == self.steps_at_copy:
             return False
         self.target_network.load_state_dict(self.train_network.state_dict())
-        if self._in_mean:
-            for own, mean in zip(self.target_network.parameters(), self._mean, strict=True):
-                own.copy_(mean)
+        self._mean.copy_to(self.target_network)
         self.steps_at_copy = self.train_steps
         self.version += 1
         return True
@@ -111,9 +108,8 @@ class Trainer:
         mirrored: bool [k], which samples to look at in a mirror. Returns the loss; raises
         FloatingPointError when it is not finite, leaving the weights as they were.
         """
-        batches = StoredBatches(samples, self._numerics.device)
-        loss = self._checked(float(self._set_gradients(batches, ranks, mirrored)))
-        self._apply_gradients()
+        loss = self._step(self.gradients.stored(samples), ranks, mirrored, Losses())
+        assert loss is not None
         return loss
 
     def tensors(self) -> dict[str, Tensor]:
@@ -158,37 +154,17 @@ class Trainer:
 
     def _fit(self, samples: SampleStore, episode: int) -> Iterator[Trained]:
         """A36: epochs of shuffled mini-batches, the last, partial one included (E30)."""
-        deferred = self._numerics.device != "cpu"
-        steps = self._deferred_steps if deferred else self._steps
-        batches = self.fit_batches(len(samples))
-        for done, (epoch, loss) in enumerate(steps(samples, episode), 1):
-            yield Trained(loss, epoch + 1, done, batches)
+        batches, losses = self.gradients.of_fit(samples), Losses(deferred=self.gradients.deferred)
+        count = self.fit_batches(len(samples))
+        for done, (epoch, ranks, mirrored) in enumerate(self._shuffled(len(samples), episode), 1):
+            loss = self._step(batches, ranks, mirrored, losses, last=done == count)
+            yield Trained(loss, epoch + 1, done, count)
         self.fits += 1
 
-    def _steps(self, samples: SampleStore, episode: int) -> Iterator[tuple[int, float | None]]:
-        """The steps of a fitting phase: the epoch each belongs to, and its loss."""
-        for epoch, ranks, mirrored in self._shuffled(len(samples), episode):
-            yield epoch, self.step(samples, ranks, mirrored)
-
-    def _deferred_steps(
-        self, samples: SampleStore, episode: int
-    ) -> Iterator[tuple[int, float | None]]:
-        """The same without ever waiting for the device: the losses are read at the end.
-
-        Samples are copied to the device once. Raises FloatingPointError after the last step when
-        a loss was not finite; the weights are useless then.
-        """
-        batches, losses = ResidentBatches(samples, self._numerics.device), []
-        last = self.fit_batches(len(samples))
-        for epoch, ranks, mirrored in self._shuffled(len(samples), episode):
-            losses.append(self._set_gradients(batches, ranks, mirrored))
-            self._apply_gradients()
-            ended = len(losses) == last
-            yield epoch, self._checked(float(torch.stack(losses).mean())) if ended else None
-
     def _shuffled(self, count: int, episode: int) -> Iterator[tuple[int, Ranks, Mask | None]]:
+        """Every mini-batch of a fitting phase with its epoch, and what of it to mirror."""
         for epoch in range(self._learning.fit_epochs):
-            self._in_mean = 0
+            self._mean.restart()
             draw = generator(self._seed, "fit", episode, epoch)
             order = draw.permutation(count)
             for start in range(0, count, self._learning.batch_size):
@@ -199,70 +175,26 @@ class Trainer:
         """Which samples of a mini-batch to look at in a mirror: by chance, half of them."""
         return draw.random(count) < 0.5 if self._learning.augmentation == "mirror" else None
 
-    def _set_gradients(
-        self, batches: Batches, ranks: Ranks, mirrored: Mask | None = None
-    ) -> Tensor:
-        """Put the gradient of a mini-batch where the optimiser looks; returns the loss.
-
-        Each thread takes one share of the mini-batch, and the shares are added up in order: the
-        result depends on the number of threads, never on how they run. Threads that wait for each
-        other after every operation would be slower, and hopeless beside another busy process.
-        """
-        size = -(-len(ranks) // self._numerics.threads)
-        shares = [slice(start, start + size) for start in range(0, len(ranks), size)]
-
-        def share(part: slice) -> tuple[Tensor, ...]:
-            some = None if mirrored is None else mirrored[part]
-            return self._share(batches, ranks[part], some, len(ranks))
-
-        work = [self._pool.submit(share, part) for part in shares[1:]]
-        loss, *gradients = share(shares[0])
-        others = [each.result() for each in work]
-        for more, *further in others:
-            loss = loss + more
-            for own, other in zip(gradients, further, strict=True):
-                own.add_(other)
-        for parameter, gradient in zip(self.train_network.parameters(), gradients, strict=True):
-            parameter.grad = gradient
-        return loss
-
-    def _share(
-        self, batches: Batches, ranks: Ranks, mirrored: Mask | None, count: int
-    ) -> tuple[Tensor, ...]:
-        """Loss and gradients of one share of a mini-batch of `count`."""
-        network, part = self.train_network, self._numerics.images_per_pass
-        reduced = self._numerics.precision == "bfloat16"
-        with arithmetic(self._in_a_share):
-            batch = batches.take(ranks)
-            if mirrored is not None:
-                batch = batch.mirrored(torch.from_numpy(mirrored).to(batch.actions.device))
-            parts = [scaled(some) for some in batch.images.split(part)]  # type: ignore[no-untyped-call]
-            maps = [trunk.maps(network, p) if reduced else network.maps(p) for p in parts]
-            error = batch.rewards - network.values(torch.cat(maps), batch.actions)
-            loss = error.square().sum() / count
-            return loss.detach(), *torch.autograd.grad(loss, list(network.parameters()))
-
-    def _apply_gradients(self) -> None:
+    def _step(
+        self,
+        batches: Batches,
+        ranks: Ranks,
+        mirrored: Mask | None,
+        losses: Losses,
+        *,
+        last: bool = True,
+    ) -> float | None:
+        """Gradient, loss, and the optimiser's step; the loss as far as `losses` tells it now."""
+        computed = self.gradients.compute(batches, ranks, mirrored)
+        try:
+            loss = losses.read(computed, last=last)
+        except FloatingPointError as error:
+            raise FloatingPointError(f"{error} at training step {self.train_steps}") from None
         with arithmetic(self._numerics):
             self._optimiser.step()
             if self._learning.target_average:
-                self._take_into_mean()
+                self._mean.take()
         self.train_steps += 1
-
-    @torch.no_grad()
-    def _take_into_mean(self) -> None:
-        weights = [parameter.detach() for parameter in self.train_network.parameters()]
-        self._in_mean += 1
-        if self._in_mean == 1:
-            self._mean = [weight.clone() for weight in weights]
-        else:
-            for mean, weight in zip(self._mean, weights, strict=True):
-                mean.lerp_(weight, 1.0 / self._in_mean)
-
-    def _checked(self, loss: float) -> float:
-        """Raise FloatingPointError for a loss that is not finite."""
-        if not math.isfinite(loss):
-            raise FloatingPointError(f"loss is {loss} at training step {self.train_steps}")
         return loss
 
 

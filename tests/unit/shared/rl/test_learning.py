@@ -52,7 +52,7 @@ class Recorder(Trainer):
         self.ranks: list[list[int]] = []
         self.mirrored: list[Any] = []
 
-    def step(self, samples: SampleStore, ranks: Any, mirrored: Any = None) -> float:
+    def _step(self, batches: Any, ranks: Any, mirrored: Any, losses: Any, **_: Any) -> float:
         self.ranks.append([int(r) for r in ranks])
         self.mirrored.append(mirrored)
         return 0.0
@@ -381,7 +381,7 @@ def test_shares_of_several_threads_add_up_to_the_mini_batch(precision: Any) -> N
     for threads in (1, 2, 2, 3, 16):
         numerics = LearnerNumerics(threads=threads, batch=4, precision=precision)
         trainer = Trainer(SMALL, LearningConfig(), numerics, 1)
-        trainer._set_gradients(StoredBatches(store, "cpu"), ranks)
+        trainer.gradients.compute(StoredBatches(store, "cpu"), ranks)
         trainers.append(trainer)
     alone, two, again, *others = (
         [p.grad for p in trainer.train_network.parameters()] for trainer in trainers
@@ -485,18 +485,20 @@ def test_deferred_steps_are_the_same_steps() -> None:
     plain = Trainer(SMALL, learning, LearnerNumerics(batch=4), 1)
     losses = [t.loss for t in plain.learn(store, 4)]
     deferred = Trainer(SMALL, learning, LearnerNumerics(batch=4), 1)
-    steps = list(deferred._deferred_steps(store, 4))
-    assert [epoch for epoch, _ in steps] == [0, 0, 0, 1, 1, 1]
-    assert [loss for _, loss in steps[:-1]] == [None] * 5
-    assert steps[-1][1] == pytest.approx(np.mean([loss for loss in losses if loss is not None]))
+    deferred.gradients.deferred = True
+    steps = list(deferred.learn(store, 4))
+    assert [done.epoch for done in steps] == [1, 1, 1, 2, 2, 2]
+    assert [done.loss for done in steps[:-1]] == [None] * 5
+    assert steps[-1].loss == pytest.approx(np.mean([loss for loss in losses if loss is not None]))
     assert deferred.train_steps == plain.train_steps == 6
     for name, tensor in plain.tensors().items():
         assert torch.equal(tensor, deferred.tensors()[name]), name
 
 
 def test_deferred_steps_report_a_loss_that_is_not_finite() -> None:
-    trainer = Trainer(SMALL, LearningConfig(batch_size=8), LearnerNumerics(), 1)
+    trainer = Trainer(SMALL, LearningConfig(batch_size=8, fit_every=100), LearnerNumerics(), 1)
+    trainer.gradients.deferred = True
     with torch.no_grad():
         trainer.train_network.out.bias.fill_(float("nan"))
     with pytest.raises(FloatingPointError):
-        list(trainer._deferred_steps(make_store(8), 100))
+        list(trainer.learn(make_store(8), 100))
