@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import cycle, product
 from statistics import median
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from shared.config import Config, MemoryConfig, Numerics
 from shared.numerics import choose
 from shared.rl.memory import SAMPLE, ReplayMemory
 from shared.rl.predictor import Predictor
-from shared.rl.retention import recompute_marks
+from shared.rl.retention.rmm import recompute_marks
 
 REQUIRED, AIM = 4.0, 7.0
 PARTS = 5
@@ -147,12 +148,13 @@ def second_pass(mode: Mode, ours: Predictor) -> tuple[Bar, str]:
     for turn, part in enumerate((images[:-added], images[-added:])):
         append(memory, part)
 
-        def describe(some: Array, turn: int = turn) -> Array:
+        def describe(some: Array, _: object, turn: int = turn) -> Array:
             described[turn] += len(some)
             return ours.descriptors(some)
 
         start_s = time.perf_counter()
-        recompute_marks(memory, MemoryConfig(), 1, describe, ours.version)
+        network = SimpleNamespace(version=ours.version, descriptors=describe)
+        recompute_marks(memory, MemoryConfig(), 1, network)
         spent[turn] = time.perf_counter() - start_s
     rows = [
         [name, len(images) - added * (1 - turn), described[turn], spent[turn]]

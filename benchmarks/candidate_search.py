@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from statistics import median
+from types import SimpleNamespace
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +22,7 @@ from experiments.runs.provenance import ROOT
 from shared.config import MemoryConfig, Numerics
 from shared.rl.memory import SAMPLE, ReplayMemory
 from shared.rl.predictor import Predictor
-from shared.rl.retention import discard
+from shared.rl.retention.strategy import Situation, discard
 from shared.rl.similarity import similar_to_newer
 
 Descriptors = npt.NDArray[np.uint8]
@@ -178,6 +179,7 @@ def episode_turn(mode: Mode) -> tuple[Bar, str]:
     memory, config = ReplayMemory(STORED[mode]), MemoryConfig(capacity=STORED[mode])
     memory.world_indices(["plus"])
     images = frames.images(mode, EPISODE)
+    network = SimpleNamespace(version=1, descriptors=no_description)
     appends, discards, both = [], [], []
     for _ in range(rounds_of(mode, short=10, full=50)):
         fill_up(memory)
@@ -185,10 +187,10 @@ def episode_turn(mode: Mode) -> tuple[Bar, str]:
         start_s = time.perf_counter()
         memory.append(rows, images)
         between_s = time.perf_counter()
-        done = discard(memory, config, 1, no_description, version=1)
+        done = discard(Situation(memory, 0, config, network))
         end_s = time.perf_counter()
         assert len(done.ids)
-        assert not done.recomputed
+        assert not done.told["recomputed"]
         appends.append((between_s - start_s) * 1e3)
         discards.append((end_s - between_s) * 1e3)
         both.append((end_s - start_s) * 1e3)
@@ -216,7 +218,7 @@ def next_rows(memory: ReplayMemory, count: int) -> npt.NDArray[np.void]:
     return rows
 
 
-def no_description(_: Descriptors) -> Descriptors:
+def no_description(_: Descriptors, __: object) -> Descriptors:
     """Stands for the predictor where no descriptors should be needed."""
     raise AssertionError("candidates ran out")
 

@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -23,7 +24,8 @@ from benchmarks.frame import Bar, Mode, mode_of, report, table
 from experiments.runs.provenance import ROOT
 from shared.config import MemoryConfig
 from shared.rl.memory import SAMPLE, ReplayMemory
-from shared.rl.retention import discard, recompute_marks
+from shared.rl.retention.rmm import recompute_marks
+from shared.rl.retention.strategy import Situation, discard
 
 EPISODE_SAMPLES = 500
 BITS = 4
@@ -79,11 +81,12 @@ def measure(size: int, rounds: int) -> Times:
     draw, config = np.random.default_rng(size), MemoryConfig(capacity=size, recompute_below=1)
     memory = full_memory(size, draw)
 
-    def describe(images: np.ndarray) -> np.ndarray:
+    def describe(images: np.ndarray, _: object) -> np.ndarray:
         return draw.integers(0, 256, (len(images), 15), np.uint8)
 
+    network = SimpleNamespace(version=1, descriptors=describe)
     passes = [
-        seconds(lambda: recompute_marks(memory, config, BITS, describe, 1))
+        seconds(lambda: recompute_marks(memory, config, BITS, network))
         for _ in range(3 if size < 100_000 else 1)
     ]
     memory.rows["candidate"], memory.rows["marked_by"] = True, 1
@@ -92,7 +95,7 @@ def measure(size: int, rounds: int) -> Times:
         append_black(memory, size - len(memory), draw)  # or there would be nothing to discard
         rows = rows_of(int(memory.ids[-1]) + 1, EPISODE_SAMPLES, draw)
         appends.append(seconds(lambda rows=rows: memory.append(rows, images)))
-        both.append(appends[-1] + seconds(lambda: discard(memory, config, 1, describe, 1)))
+        both.append(appends[-1] + seconds(lambda: discard(Situation(memory, 0, config, network))))
         assert len(memory) < size
     return Times(median(passes), median(appends), median(both))
 

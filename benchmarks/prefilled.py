@@ -21,7 +21,7 @@ from shared.errors import BusError, RouterMissing
 from shared.keys import PROGRESS
 from shared.messages import Episode, ProgressRequest, RobotProgress
 from shared.rl.memory import ReplayMemory
-from shared.rl.retention import Discard
+from shared.rl.retention.strategy import Discard
 from shared.rl.turn import Maintenance
 
 LIFE = "beec0ffeebee"
@@ -72,8 +72,8 @@ def fill(folder: Path, config: Config, images: Images | None = None) -> int:
         assert pending is not None
         memory.worlds = storage.worlds()
         memory.append(*storage.rows_of(pending[0]))
-        kept = Discard(config.memory.threshold_percent, memory.capacity)
-        storage.apply_turn(*pending, memory, Maintenance(kept, equalised=False))
+        nothing = Discard(memory.capacity)
+        storage.apply_turn(*pending, memory, Maintenance(nothing, equalised=False))
         number += 1
     storage.close()
     return number

@@ -48,7 +48,6 @@ class SingleProcess:
         self.actor = Actor(config, config.robot.id, LIFE, self.acting)
         self.memory = ReplayMemory(config.memory.capacity)
         self.counters = Counters()
-        self.threshold_percent = config.memory.threshold_percent
         self.judging = Predictor(config.network, config.numerics.replay)
         self.trainer = Trainer(
             config.network, config.learning, config.numerics.learner, config.run.seed
@@ -104,10 +103,7 @@ class SingleProcess:
             self.memory, episode, commit.first_id, commit.commit, commit.episode
         )
         self.memory.append(rows[: commit.stored], images[: commit.stored])
-        maintenance = maintain(
-            self.memory, commit.episode, config.memory, self.threshold_percent, self.judging
-        )
-        self.threshold_percent = maintenance.discarded.threshold_percent
+        maintenance = maintain(self.memory, commit.episode, config.memory, self.judging)
         if not commit.episode:  # the memory is being filled: not an episode, no training (E9)
             return TurnDone(commit, episode, maintenance, (), False)
         trained = tuple(self.trainer.learn(self.memory, commit.episode))

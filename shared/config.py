@@ -11,11 +11,17 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from shared.facts import NAME
+from shared.rl.retention.table import STRATEGIES
+
+if TYPE_CHECKING:
+    StrategyName = str
+else:  # a type checker cannot read the table
+    StrategyName = Literal[tuple(STRATEGIES)]
 
 Name = Annotated[str, Field(pattern=NAME.pattern)]
 """A run, robot or world name: it becomes part of a Zenoh key, so no '/', '*', '$' or spaces."""
@@ -258,7 +264,8 @@ class MemoryConfig(Section):
     """By how much it grows at a time; 0: 5000, scaled with `capacity` (A44, E17b)."""
     fill: Literal["random", "policy", "none"] = "random"
     """How the memory is filled before the first episode (A13, E9)."""
-    strategy: Literal["rmm", "normm"] = "rmm"
+    strategy: StrategyName = "rmm"
+    """Which samples go when the memory is full (A28-A34)."""
     rule: Literal["paper", "cover"] = "paper"
     """Marking against any newer sample, or only against kept ones (E23)."""
     threshold_percent: int = Field(default=1, ge=1, le=100)

@@ -381,6 +381,13 @@ class RobotProgress(Message):
 # ---------------------------------------------------------------- replay -> learner
 
 
+class Told(Message):
+    """One number that a strategy of retention tells of itself."""
+
+    name: str
+    value: Count
+
+
 class ReplayState(Message):
     """Heartbeat of replay: newest numbers only, everything else is pulled. Replay to all."""
 
@@ -398,9 +405,9 @@ class ReplayState(Message):
     size: Count
     capacity: Count
     filling: bool
-    by_action: tuple[Count, Count, Count]
-    candidates_by_action: tuple[Count, Count, Count]
-    threshold_bits: Count
+    by_action: Annotated[tuple[Count, ...], Field(min_length=ACTION_COUNT, max_length=ACTION_COUNT)]
+    retention: Annotated[tuple[Told, ...], Field(max_length=64)] = ()
+    """What the strategy of retention tells of itself."""
     weights_version: Count
     activity: Literal["idle", "committing", "descriptors", "equalising", "discarding", "waiting"]
     progress: Fraction = 1.0

@@ -26,7 +26,7 @@ class Outcome:
     digests: list[tuple[int, str]]
     """Of every submission: episode number and what was seen, done and rewarded."""
     memory: ReplayMemory
-    threshold_percent: int
+    kept: dict[str, int]
     tensors: dict[str, torch.Tensor]
     """Both networks and the optimiser."""
     version: int
@@ -46,7 +46,7 @@ def single_process(config: Config, episodes: int, changes: Sequence[WorldChange]
     robot.close()
     trainer = loop.trainer
     tensors = {name: t.clone() for name, t in trainer.tensors().items()}
-    return Outcome(digests, loop.memory, loop.threshold_percent, tensors, trainer.version)
+    return Outcome(digests, loop.memory, loop.memory.kept, tensors, trainer.version)
 
 
 def distributed(config: Config, folder: Path) -> Outcome:
@@ -64,13 +64,13 @@ def distributed(config: Config, folder: Path) -> Outcome:
 
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         counters = json.loads(file.metadata()["state"])["counters"]
-    return Outcome(digests, memory, position.threshold_percent, tensors, counters["version"])
+    return Outcome(digests, memory, position.kept, tensors, counters["version"])
 
 
 def assert_equal(one: Outcome, other: Outcome) -> None:
     """Bit for bit."""
     assert one.digests == other.digests
-    assert one.threshold_percent == other.threshold_percent
+    assert one.kept == other.kept
     assert one.memory.capacity == other.memory.capacity
     assert one.version == other.version
     one.memory.check_valid()

@@ -45,10 +45,8 @@ def episode_row(loop: SingleProcess, done: TurnDone, stage: str, seconds: float)
         **dict(zip(SHORT_NAMES, by_action, strict=True)),
         "by_world": " ".join(f"{name}={count}" for name, count in counts),
         "discarded": len(discarded.ids),
-        "last_resort": discarded.last_resort,
-        "recomputed": int(discarded.recomputed),
         "equalised": int(done.maintenance.equalised),
-        "threshold_percent": discarded.threshold_percent,
+        **discarded.told,
         "seconds": round(seconds, 2),
     }
 

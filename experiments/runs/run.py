@@ -35,6 +35,8 @@ from shared.errors import ConfigError, StateError
 from shared.messages import WorldChange
 from shared.numerics import Role, settle
 from shared.rl.network import to_bytes
+from shared.rl.retention.rmm import force_candidates
+from shared.rl.retention.strategy import begin
 from shared.settings import claim
 from shared.statefile import write_atomically
 
@@ -186,13 +188,16 @@ class Run:
             at = self._offset + int(change["at_episode"])
             self._change(WorldChange.model_validate({**change, "at_episode": at}))
         if stage.force_candidates:
-            loop.memory.force_candidates(loop.memory.ids)
+            force_candidates(loop.memory, loop.memory.ids)
         # Both change on the way: a stage sets them where it says something new.
         first = not self._totals.stages
-        named = "threshold_percent" in merged(self.plan.config, stage.config).get("memory", {})
-        changed = before.memory.threshold_percent != config.memory.threshold_percent
-        if named if first else changed:  # a first stage that names none keeps it (E45)
-            loop.threshold_percent = config.memory.threshold_percent
+        named = merged(self.plan.config, stage.config).get("memory", {})
+        known, wanted = begin(before.memory), begin(config.memory)
+        loop.memory.kept |= {  # a first stage that names none keeps it (E45)
+            key: value
+            for key, value in wanted.items()
+            if (key in named if first else known[key] != value)
+        }
         if first or before.memory.capacity != config.memory.capacity:
             loop.memory.set_capacity(config.memory.capacity)
         self._totals.stages.append(

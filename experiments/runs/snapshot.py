@@ -41,7 +41,7 @@ def save(folder: Path, loop: SingleProcess, extra: dict[str, Any]) -> None:
         "schema": SCHEMA,
         "counters": loop.counters.to_dict(),
         "capacity": memory.capacity,
-        "threshold_percent": loop.threshold_percent,
+        "kept": memory.kept,
         "actor": loop.actor.state(),
         "driver": loop.env.driver.saved(),
         "extra": extra,
@@ -69,7 +69,7 @@ def restore(folder: Path, loop: SingleProcess) -> dict[str, Any]:
         if loop.counters.episode != episode:
             raise ValueError(f"episode {loop.counters.episode}, but the checkpoint has {episode}")
         loop.memory = _memory(folder / MEMORY, int(state["capacity"]))
-        loop.threshold_percent = int(state["threshold_percent"])
+        loop.memory.kept = {str(name): int(value) for name, value in state["kept"].items()}
         loop.env.driver.restore(state["driver"])
         loop.actor.restore(state["actor"])
         extra = state["extra"]

@@ -21,7 +21,7 @@ from services.monitor.words import (
     fitness,
     learner_doing,
     replay_doing,
-    threshold,
+    retention,
 )
 from shared.messages import ActorState, LearnerState, Message, ReplayState, RobotState
 
@@ -130,7 +130,7 @@ def line(view: View) -> str:
             f"bumps {replay.bumps}",
             f"laps {replay.laps_left} left {replay.laps_right} right",
             f"memory {replay.size}/{replay.capacity} ({by_action(replay.by_action)})",
-            f"threshold {threshold(replay)}",
+            f"retention {retention(replay)}",
         ]
         if replay.filling:
             parts.append(replay_doing(replay))
@@ -186,9 +186,8 @@ def _memory_rows(replay: ReplayState) -> Iterator[tuple[RenderableType, ...]]:
     share = fill_share(replay)
     bar = ProgressBar(total=1.0, completed=share, width=BAR_WIDTH)
     yield "memory", bar, f"{replay.size} of {replay.capacity}, {replay_doing(replay)}"
-    yield "  by action", by_action(replay.by_action), f"threshold {threshold(replay)}"
-    if any(replay.candidates_by_action):
-        yield "  candidates", by_action(replay.candidates_by_action), ""
+    yield "  by action", by_action(replay.by_action), ""
+    yield "  retention", retention(replay), ""
 
 
 def _learner_rows(learner: LearnerState) -> Iterator[tuple[RenderableType, ...]]:

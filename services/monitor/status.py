@@ -13,8 +13,14 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 
 from services.monitor.heartbeats import Reader, Snapshot
-from services.monitor.words import by_action, duration, fitness, learner_doing, replay_doing
-from services.monitor.words import threshold as threshold_text
+from services.monitor.words import (
+    by_action,
+    duration,
+    fitness,
+    learner_doing,
+    replay_doing,
+    retention,
+)
 from shared.bus import Bus
 from shared.config import Config
 from shared.errors import BadMessage, BusError
@@ -147,7 +153,7 @@ def _facts(snapshot: Snapshot) -> list[tuple[str, str]]:
         text += f"weights {m.weights_version}"
         rows.append(("replay", text))
         text = f"{m.size} of {m.capacity}: {by_action(m.by_action)}, "
-        text += f"threshold {threshold_text(m)}"
+        text += f"retention {retention(m)}"
         rows.append(("memory", text))
     if snapshot.learner is not None:
         n = snapshot.learner.message

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from shared.facts import SHORT_NAMES
 from shared.messages import LearnerState, ReplayState
 
-DESCRIPTOR_BITS = 120
-"""Length of a descriptor, of which the threshold is a part (A29)."""
 
 
 def duration(seconds: float) -> str:
@@ -53,8 +51,7 @@ def fill_share(replay: ReplayState) -> float:
     return min(1.0, replay.size / replay.capacity) if replay.capacity else 0.0
 
 
-def threshold(replay: ReplayState) -> str:
-    """The similarity threshold, or a dash while there is none."""
-    bits = replay.threshold_bits
-    unit = "bit" if bits == 1 else "bits"
-    return f"{bits} {unit} of {DESCRIPTOR_BITS}" if bits else "-"
+def retention(replay: ReplayState) -> str:
+    """What the strategy of retention tells of itself; a dash while that is nothing."""
+    told = (f"{each.name.replace('_', ' ')} {each.value}" for each in replay.retention)
+    return "  ".join(told) or "-"

@@ -34,6 +34,7 @@ from shared.messages import (
     ProgressRequest,
     ReplayState,
     SnapshotRequest,
+    Told,
     Turns,
     TurnsRequest,
 )
@@ -151,8 +152,7 @@ class Intake:
             capacity=view.position.capacity,
             filling=filling(counters, memory),
             by_action=view.by_action,
-            candidates_by_action=view.candidates,
-            threshold_bits=view.threshold_bits,
+            retention=tuple(Told(name=name, value=n) for name, n in view.retention.items()),
             weights_version=view.weights_version,
             activity=view.activity,
             progress=view.progress,

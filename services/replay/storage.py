@@ -24,6 +24,7 @@ from services.replay.tables import (
 )
 from shared.messages import Episode, Turn
 from shared.rl.memory import ReplayMemory
+from shared.rl.retention.strategy import columns
 from shared.rl.turn import Maintenance, sample_rows
 
 CHANGES_KEPT = 512
@@ -124,7 +125,7 @@ class Storage(Feed):
                 column = _column(memory, REWARDS)
                 self._put_change(txn, number, "rewards", column)
                 txn.put(b"rewards", column, db=self._db["columns"])
-            if done.discarded.recomputed or done.decreed:
+            if done.discarded.marked:
                 txn.put(b"marks", _column(memory, MARKS), db=self._db["columns"])
             turn, turn_change = position.turn, position.turn_change
             if commit.episode:
@@ -137,12 +138,7 @@ class Storage(Feed):
                 }
                 txn.put(key_of(turn), pack(entry), db=self._db["turns"])
             position = Position(
-                number,
-                commit.commit,
-                turn,
-                turn_change,
-                done.discarded.threshold_percent,
-                done.discarded.capacity,
+                number, commit.commit, turn, turn_change, memory.capacity, memory.kept
             )
             self._put_meta(txn, "position", asdict(position))
             self._forget_changes(txn, position)
@@ -162,7 +158,9 @@ class Storage(Feed):
     def load(self) -> ReplayMemory:
         """The memory as of the newest applied turn."""
         with self._env.begin() as txn:
-            memory = ReplayMemory(Position(**self._meta(txn, "position")).capacity)
+            position = Position(**self._meta(txn, "position"))
+            memory = ReplayMemory(position.capacity)
+            memory.kept = position.kept
             memory.worlds = list(self._meta(txn, "worlds"))
             ids = self._alive(txn)
             for start in range(0, len(ids), PART_ROWS):
@@ -171,7 +169,7 @@ class Storage(Feed):
             self._overlay_rewards(txn, memory.rows)
             marks = self._stored_column(txn, "marks", MARKS)
         known, where = match(memory.ids, marks["id"])
-        for name in ("descriptor", "described_by", "candidate", "forced", "marked_by"):
+        for name, *_ in columns():
             memory.rows[name][known] = marks[name][where]
         return memory
 

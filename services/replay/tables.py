@@ -2,13 +2,13 @@
 
 Images are written once and never changed; what changes lies beside them. Tables:
 
-meta      counters, change number, processed commit, threshold, capacity, identity of the run
+meta      counters, change number, processed commit, capacity, what retention keeps, run
 commits   commit number -> record of the submission (provenance, metrics)
 identity  robot, life, number -> commit number: the deduplication
 images    insertion number -> 3750 bytes
 samples   insertion number -> row (reward as inserted)
 dead      insertion number -> change number of its discard; kept until the feed forgets the change
-columns   "rewards": all rewards after the newest equalisation; "marks": descriptors and marks
+columns   "rewards": all rewards after the newest equalisation; "marks": those of retention
 changes   change number -> kind and ids: the feed
 turns     global episode number -> what the learner needs to know
 
@@ -18,7 +18,7 @@ leaves one of the two states, and the turn is done again from the first.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,15 +33,13 @@ from shared.config import MemoryConfig
 from shared.errors import StateError
 from shared.facts import IMAGE_SHAPE
 from shared.rl.memory import SAMPLE
+from shared.rl.retention.strategy import columns
 
 SCHEMA = 3
 MAP_BYTES = 1 << 38
 """Largest size of the file; only what is used exists."""
 REWARDS = np.dtype([("id", "<u8"), ("reward", "<f4")])
-MARKS = np.dtype(
-    [(name, *SAMPLE.fields[name][:1]) for name in ("id", "descriptor", "described_by")]  # type: ignore[index]
-    + [("candidate", "?"), ("forced", "?"), ("marked_by", "<u4")]
-)
+MARKS = np.dtype([("id", "<u8"), *columns()])
 TABLES = ("meta", "commits", "identity", "images", "samples", "dead", "columns", "changes", "turns")
 Txn = Any
 
@@ -79,9 +77,10 @@ class Position:
     turn: int
     """Newest counted episode whose turn is applied."""
     turn_change: int
-    threshold_percent: int
     capacity: int
     """N in force: it may have grown (A44)."""
+    kept: dict[str, int] = field(default_factory=dict)
+    """What strategies of retention keep from one discard to the next."""
 
 
 class Tables:
@@ -99,7 +98,7 @@ class Tables:
             if known is None:
                 self._put_meta(txn, "identity", [SCHEMA, identity])
                 self._put_meta(txn, "counters", Counters().to_dict())
-                start = Position(0, 0, 0, 0, config.threshold_percent, config.capacity)
+                start = Position(0, 0, 0, 0, config.capacity)
                 self._put_meta(txn, "position", asdict(start))
                 self._put_meta(txn, "worlds", [])
             elif list(known) != [SCHEMA, identity]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -18,11 +18,13 @@ import numpy as np
 from services.replay.numbering import Commit
 from services.replay.storage import Storage
 from services.replay.tables import Position
+from shared.facts import ACTION_COUNT
 from shared.metrics import MetricsLog
 from shared.numerics import settle
-from shared.rl.descriptor import threshold_bits
 from shared.rl.memory import ReplayMemory
 from shared.rl.predictor import Predictor
+from shared.rl.retention.strategy import strategy
+from shared.rl.retention.table import TELLS
 from shared.rl.turn import Maintenance, maintain
 from shared.service import TICK_S, Service, Stopped
 from shared.weights import WeightsFetcher
@@ -30,8 +32,8 @@ from shared.weights import WeightsFetcher
 Activity = Literal["idle", "committing", "descriptors", "equalising", "discarding", "waiting"]
 COLUMNS = (
     "episode robot ended bump fitness fitness_mean_100 actions total_actions bumps laps_left "
-    "laps_right longest_run_actions samples memory capacity discarded last_resort recomputed "
-    "equalised threshold_percent weights_version"
+    "laps_right longest_run_actions samples memory capacity discarded equalised "
+    + " ".join((*TELLS, "weights_version"))
 )
 
 
@@ -40,18 +42,14 @@ class View:
     """What others may see of the memory: replaced as a whole, never changed."""
 
     position: Position
-    by_action: tuple[int, int, int] = (0, 0, 0)
-    candidates: tuple[int, int, int] = (0, 0, 0)
+    by_action: tuple[int, ...] = (0,) * ACTION_COUNT
+    retention: Mapping[str, int] = field(default_factory=dict)
+    """What the strategy of retention tells of itself."""
     weights_version: int = 0
     activity: Activity = "idle"
     progress: float = 1.0
     fitness: tuple[int, ...] = field(default=())
     """Of the last 100 counted episodes."""
-
-    @property
-    def threshold_bits(self) -> int:
-        """Similarity threshold of the next recomputation, in bits."""
-        return threshold_bits(self.position.threshold_percent)
 
     @property
     def fitness_mean(self) -> float:
@@ -118,7 +116,6 @@ class TurnWorker(threading.Thread):
             memory,
             commit.episode,
             self._config,
-            self.view.position.threshold_percent,
             self._predictor,
             describing=self._progress("descriptors"),
             equalising=self._progress("equalising"),
@@ -127,16 +124,8 @@ class TurnWorker(threading.Thread):
             self._recent.append(int(record["fitness"]))
             self._metrics.write(self._row(commit, record, memory, done))
         position = self._storage.apply_turn(commit, record, memory, done)
-        if done.discarded.last_resort:
-            self._me.log.warning(
-                "episode %d: %d samples discarded by age, candidates ran out",
-                commit.episode,
-                done.discarded.last_resort,
-            )
-        if done.decreed:
-            self._me.log.info(
-                "episode %d: %d samples marked by decree", commit.episode, done.decreed
-            )
+        if done.discarded.warning:
+            self._me.log.warning("episode %d: %s", commit.episode, done.discarded.warning)
         self._show(memory, position=position, activity="idle")
 
     def _await_weights(self, least: int) -> None:
@@ -156,11 +145,10 @@ class TurnWorker(threading.Thread):
     def _show(
         self, memory: ReplayMemory, *, activity: Activity, position: Position | None = None
     ) -> None:
-        by_action, candidates = memory.by_action(), memory.candidates_by_action()
         self.view = View(
             position or self.view.position,
-            (by_action[0], by_action[1], by_action[2]),
-            (candidates[0], candidates[1], candidates[2]),
+            tuple(memory.by_action()),
+            strategy(self._config.strategy).state(memory),
             self._predictor.version,
             activity,
             fitness=tuple(self._recent),
@@ -174,10 +162,8 @@ class TurnWorker(threading.Thread):
             "memory": len(memory),
             "capacity": done.discarded.capacity,
             "discarded": len(done.discarded.ids),
-            "last_resort": done.discarded.last_resort,
-            "recomputed": int(done.discarded.recomputed),
             "equalised": int(done.equalised),
-            "threshold_percent": done.discarded.threshold_percent,
+            **done.discarded.told,
         }
         return {**self._basic_row(commit, record), **extra}
 

@@ -1,18 +1,19 @@
 """The replay memory: samples in order of insertion, each image stored once as uint8.
 
 `SampleStore` holds what training needs and serves as the learner's mirror; `ReplayMemory` adds
-provenance, descriptors and candidate marks. Which samples go is decided in `retention`.
+where samples come from and the columns of `retention`, which decides what goes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from shared.facts import ACTION_COUNT, IMAGE_SHAPE
-from shared.rl.descriptor import BYTES
+from shared.rl.retention.strategy import columns, strategy
+from shared.rl.retention.table import STRATEGIES
 
 Ids = npt.NDArray[np.uint64]
 Mask = npt.NDArray[np.bool_]
@@ -33,11 +34,7 @@ SAMPLE = np.dtype(
         ("x_m", "<f4"),
         ("y_m", "<f4"),
         ("heading_rad", "<f4"),
-        ("descriptor", "u1", (BYTES,)),
-        ("described_by", "<u4"),  # weights version of the descriptor; 0: none yet
-        ("candidate", "?"),
-        ("forced", "?"),  # marked by decree (A44): a recomputation does not wipe it
-        ("marked_by", "<u4"),
+        *columns(),
     ]
 )
 BLOCK = 4096
@@ -55,12 +52,12 @@ class SampleStore:
         self._free: list[int] = []
 
     def __len__(self) -> int:
-        """Number of samples."""
+        """Return the number of samples."""
         return len(self.rows)
 
     @property
     def ids(self) -> Ids:
-        """Insertion numbers, ascending: uint64 [n]."""
+        """The insertion numbers, ascending: uint64 [n]."""
         return self.rows["id"]
 
     def append(self, rows: npt.NDArray[np.void], images: Images) -> None:
@@ -96,7 +93,7 @@ class SampleStore:
         self.rows = _whole(self.rows)[keep].view(self.rows.dtype)
 
     def ranks(self, ids: Ids) -> npt.NDArray[np.int64]:
-        """Positions of insertion numbers among the stored. Raises KeyError if one is missing."""
+        """Return the positions of insertion numbers. Raises KeyError if one is missing."""
         ranks = np.searchsorted(self.ids, ids)
         if np.any(ranks >= len(self)) or np.any(self.ids[np.minimum(ranks, len(self) - 1)] != ids):
             raise KeyError("insertion number not in memory")
@@ -112,7 +109,7 @@ class SampleStore:
         self.rows["reward"][self.ranks(ids)] = rewards
 
     def images(self, ranks: npt.NDArray[np.int64]) -> Images:
-        """Copies of the images at these ranks: uint8 [k, 50, 75]."""
+        """Return copies of the images at these ranks: uint8 [k, 50, 75]."""
         slots = self.rows["slot"][ranks]
         images = np.empty((len(slots), *IMAGE_SHAPE), np.uint8)
         blocks, places = np.divmod(slots, BLOCK)
@@ -122,13 +119,13 @@ class SampleStore:
         return images
 
     def parts(self, ranks: npt.NDArray[np.int64]) -> Iterator[tuple[npt.NDArray[np.int64], Images]]:
-        """Some of these ranks at a time with their images: all at once may be a second memory."""
+        """Yield some of these ranks at a time with their images: all would be a second memory."""
         for start in range(0, len(ranks), PART):
             some = ranks[start : start + PART]
             yield some, self.images(some)
 
     def by_action(self) -> list[int]:
-        """Number of samples of each action."""
+        """Return the number of samples of each action."""
         return [int(n) for n in np.bincount(self.rows["action"], minlength=ACTION_COUNT)]
 
     def check_valid(self) -> None:
@@ -136,14 +133,15 @@ class SampleStore:
         slots = [int(slot) for slot in self.rows["slot"]]
         places = sorted([*slots, *self._free])
         rewards = self.rows["reward"]
-        for holds, invariant in (
-            (bool(np.all(self.ids[1:] > self.ids[:-1])), "insertion numbers grow"),
-            (places == list(range(len(self._blocks) * BLOCK)), "each slot is used or free, once"),
-            (not len(self) or int(self.rows["action"].max()) < ACTION_COUNT, "actions are known"),
-            (bool(np.all(np.abs(rewards) <= 1.0)), "rewards lie in [-1, 1]"),
-        ):
-            if not holds:
-                raise AssertionError(f"replay memory: broken invariant: {invariant}")
+        actions = not len(self) or int(self.rows["action"].max()) < ACTION_COUNT
+        _check(
+            [
+                (bool(np.all(self.ids[1:] > self.ids[:-1])), "insertion numbers grow"),
+                (places == list(range(len(self._blocks) * BLOCK)), "each slot is used or free"),
+                (actions, "actions are known"),
+                (bool(np.all(np.abs(rewards) <= 1.0)), "rewards lie in [-1, 1]"),
+            ]
+        )
 
     def _take_slots(self, count: int) -> npt.NDArray[np.uint32]:
         while len(self._free) < count:
@@ -167,11 +165,14 @@ def _whole(rows: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
 
 
 class ReplayMemory(SampleStore):
-    """The store of replay: capacity, provenance, descriptors and marks (A27-A34)."""
+    """The store of replay, with capacity and provenance (A27), and what strategies add."""
 
     def __init__(self, capacity: int) -> None:
         super().__init__(SAMPLE)
         self.worlds: list[str] = []
+        """Names that the column `world` points into."""
+        self.kept: dict[str, int] = {}
+        """What strategies of retention keep from one discard to the next."""
         self.set_capacity(capacity)
 
     def set_capacity(self, capacity: int) -> None:
@@ -181,38 +182,22 @@ class ReplayMemory(SampleStore):
         self.capacity = capacity
 
     def world_indices(self, names: Sequence[str]) -> npt.NDArray[np.uint16]:
-        """Indices of world names in `worlds`, which grows as needed."""
+        """Return the indices of world names in `worlds`, which grows as needed."""
         for name in names:
             if name not in self.worlds:
                 self.worlds.append(name)
         return np.array([self.worlds.index(name) for name in names], np.uint16)
 
-    def candidates_by_action(self) -> list[int]:
-        """Number of discard candidates of each action."""
-        marked = self.rows["action"][self.rows["candidate"]]
-        return [int(n) for n in np.bincount(marked, minlength=ACTION_COUNT)]
-
-    def force_candidates(self, ids: Ids) -> None:
-        """Mark samples by decree (A44): the marks stay until the samples are discarded."""
-        ranks = self.ranks(ids)
-        self.rows["forced"][ranks] = True
-        self.rows["candidate"][ranks] = True
-
     def check_valid(self) -> None:
         """Raise AssertionError naming the first invariant that does not hold."""
         super().check_valid()
-        rows = self.rows
-        for holds, invariant in (
-            (bool(np.all(rows["candidate"] | ~rows["forced"])), "forced samples are candidates"),
-            (
-                bool(np.all(~rows["candidate"] | rows["forced"] | (rows["marked_by"] > 0))),
-                "candidates know the version that marked them",
-            ),
-            (
-                bool(np.all((rows["marked_by"] == 0) | (rows["described_by"] > 0))),
-                "marked samples have a descriptor",
-            ),
-            (not len(rows) or int(rows["world"].max()) < len(self.worlds), "worlds are known"),
-        ):
-            if not holds:
-                raise AssertionError(f"replay memory: broken invariant: {invariant}")
+        worlds = not len(self) or int(self.rows["world"].max()) < len(self.worlds)
+        _check([(worlds, "worlds are known")])
+        for name in STRATEGIES:
+            _check(strategy(name).invariants(self.rows))
+
+
+def _check(invariants: Iterable[tuple[bool, str]]) -> None:
+    for holds, invariant in invariants:
+        if not holds:
+            raise AssertionError(f"replay memory: broken invariant: {invariant}")

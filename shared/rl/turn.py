@@ -1,8 +1,7 @@
 """One turn in the order of E25, as far as it concerns the memory.
 
-append -> marks by decree -> discard (candidates as needed) -> equalise -> (the learner:) train or
-fit -> target rule -> checkpoint -> publish. The replay service and the single-process loop both
-call these.
+append -> discard -> equalise -> (the learner:) train or fit -> target rule -> checkpoint ->
+publish. The replay service and the single-process loop both call these.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from shared.rl.engine import Progress
 from shared.rl.equalisation import due, equalised
 from shared.rl.memory import SAMPLE, Images, ReplayMemory
 from shared.rl.predictor import Predictor
-from shared.rl.retention import Discard, discard
+from shared.rl.retention.strategy import Discard, Situation, beyond, discard
 
 if TYPE_CHECKING:
     from shared.config import MemoryConfig
@@ -30,8 +29,6 @@ class Maintenance:
 
     discarded: Discard
     equalised: bool
-    decreed: int = 0
-    """Samples that were marked by decree (A44)."""
 
 
 def sample_rows(
@@ -62,50 +59,26 @@ def maintain(
     memory: ReplayMemory,
     number: int,
     config: MemoryConfig,
-    threshold_percent: int,
     predictor: Predictor,
     *,
     describing: Progress | None = None,
     equalising: Progress | None = None,
 ) -> Maintenance:
-    """Discard and, when due at episode `number`, mark by decree before and equalise after.
-
-    `memory` is changed in place.
-    """
-
-    def describe(images: Images) -> npt.NDArray[np.uint8]:
-        described = int(np.sum(memory.rows["described_by"] == predictor.version))
-        return predictor.descriptors(images, _beyond(described, len(memory), describing))
-
-    decreed = _mark_by_decree(memory, number, config)
-    dropped = discard(memory, config, threshold_percent, describe, predictor.version)
+    """Discard and, when due at episode `number`, equalise after it. `memory` is changed."""
+    discarded = discard(Situation(memory, number, config, predictor, describing))
     refresh = due(number, config.equalise_every) and len(memory) > 0
     if refresh:
         values = _current_values(memory, predictor, equalising)
         memory.rows["reward"] = equalised(memory.rows["reward"], values, config)
-    return Maintenance(dropped, refresh, decreed)
-
-
-def _mark_by_decree(memory: ReplayMemory, number: int, config: MemoryConfig) -> int:
-    """At `mark_all_at_episode`, mark all samples stored before that episode; how many (A44)."""
-    if number == 0 or number != config.mark_all_at_episode:
-        return 0
-    older = memory.ids[memory.rows["episode"] < number]
-    memory.force_candidates(older)
-    return len(older)
+    return Maintenance(discarded, refresh)
 
 
 def _current_values(
     memory: ReplayMemory, predictor: Predictor, progress: Progress | None
 ) -> npt.NDArray[np.float32]:
-    """Q of each stored image and its action under the current weights: float32 [n]."""
+    """Return Q of each stored image and its action under the current weights: float32 [n]."""
     values = np.empty(len(memory), np.float32)
     for some, images in memory.parts(np.arange(len(memory))):
-        report = _beyond(int(some[0]), len(memory), progress)
+        report = beyond(int(some[0]), len(memory), progress)
         values[some] = predictor.values(images, memory.rows["action"][some], report)
     return values
-
-
-def _beyond(before: int, total: int, progress: Progress | None) -> Progress | None:
-    """Progress of a part, reported as that of the whole."""
-    return None if progress is None else lambda done, _: progress(before + done, total)

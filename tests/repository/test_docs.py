@@ -151,7 +151,8 @@ def test_places_in_the_algorithm_exist() -> None:
 
 def defined(name: str) -> bool:
     """Whether a (dotted) name leads to something in one of the modules of the algorithm."""
-    modules = [f"shared.rl.{path.stem}" for path in (ROOT / "shared" / "rl").glob("[a-z]*.py")]
+    files = (ROOT / "shared" / "rl").rglob("[a-z]*.py")
+    modules = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in files]
     modules += ["services.actor.actor", "services.replay.numbering"]
     for path in modules:
         module = importlib.import_module(path)

@@ -43,7 +43,7 @@ def reference(config: Config) -> Outcome:
     assert (outcome.memory.rows["candidate"] & ~outcome.memory.rows["forced"]).any()
     assert outcome.memory.rows["forced"].any()
     assert outcome.memory.capacity == config.memory.capacity_max > config.memory.capacity
-    assert outcome.threshold_percent > config.memory.threshold_percent
+    assert outcome.kept["threshold_percent"] > config.memory.threshold_percent
     assert outcome.version > 10
     return outcome
 

@@ -15,11 +15,12 @@ from services.launcher.live import View, duration, line, panel, warnings
 from services.launcher.supervisor import ChildStatus
 from services.monitor.heartbeats import Reader, Seen, Snapshot
 from shared.keys import ACTOR_STATE, REPLAY_STATE, Stream
-from shared.messages import ActorState, LearnerState, Message, ReplayState, RobotState
+from shared.messages import ActorState, LearnerState, Message, ReplayState, RobotState, Told
 
 REPLAY = message(
     ReplayState, episode=137, size=4321, capacity=6000, by_action=(2000, 1200, 1121),
-    threshold_bits=1, fitness_mean_100=38.25, bumps=120, laps_left=3, laps_right=2, actions=12345,
+    retention=(Told(name="threshold_percent", value=1),),
+    fitness_mean_100=38.25, bumps=120, laps_left=3, laps_right=2, actions=12345,
 )  # fmt: skip
 LEARNER = message(
     LearnerState, episode=136, weights_version=42, activity="fitting", fit_epoch=2,
@@ -61,7 +62,7 @@ def test_the_line_tells_everything() -> None:
         "bumps 120",
         "laps 3 left 2 right",
         "memory 4321/6000 (forward 2000  left 1200  right 1121)",
-        "threshold 1 bit of 120",
+        "retention threshold percent 1",
         "21.3 steps/s",
         "weights 42",
         "learner fitting, epoch 2, 25 %",
@@ -73,7 +74,7 @@ def test_the_panel_tells_everything() -> None:
     for part in (
         "run demo", "1:02:05", "137 of 200", "fitness 38.2", "120", "laps 3 left, 2 right",
         "12345", "21.3 per second", "4321 of 6000", "forward 2000  left 1200  right 1121",
-        "threshold 1 bit of 120", "weights version 42", "540 training steps", "2 fitting phases",
+        "threshold percent 1", "weights version 42", "540 training steps", "2 fitting phases",
         "loss 0.01234", "fitting, epoch 2, 25 %", "robot r1", "driving in minus", "step 17",
         "Ctrl-C",
     ):  # fmt: skip
@@ -98,7 +99,7 @@ def test_filling_shows_its_progress() -> None:
     shown = full(replay=Seen(filling, 0.0))
     assert "filling, 10 %" in line(shown)
     assert "fitness -" in line(shown)
-    assert "threshold -" in line(shown)
+    assert "retention -" in line(shown)
     assert "filling, 10 %" in text(shown)
 
 

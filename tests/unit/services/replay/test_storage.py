@@ -85,12 +85,11 @@ class Bench:
         commit, record = pending
         rows, images = self.storage.rows_of(commit)
         self.memory.append(rows, images)
-        percent = self.storage.position().threshold_percent
         predictor: Any = FakePredictor(self.version)
-        done = maintain(self.memory, commit.episode, self.config, percent, predictor)
+        done = maintain(self.memory, commit.episode, self.config, predictor)
         position = self.storage.apply_turn(commit, record, self.memory, done)
         self._model_turn(rows, images, commit.episode)
-        assert (position.change, position.threshold_percent) == (self.change, self.percent)
+        assert (position.change, position.kept["threshold_percent"]) == (self.change, self.percent)
         assert position.capacity == self.capacity
         assert position.processed == commit.commit
         return True
@@ -102,7 +101,8 @@ class Bench:
             sample["episode"] = episode
             self.model.append({**sample, "candidate": False})
         self._note(len(rows))
-        if episode and episode == self.config.mark_all_at_episode:
+        decreed = self.config.strategy == "rmm" and self.config.mark_all_at_episode
+        if episode and episode == decreed:
             for s in self.model:
                 if s["episode"] != episode:
                     s["forced"] = s["candidate"] = True
@@ -145,6 +145,7 @@ class Bench:
         loaded.check_valid()
         assert self.storage.size() == len(loaded)
         assert loaded.capacity == self.memory.capacity == self.capacity
+        assert loaded.kept == self.memory.kept
         for name in loaded.rows.dtype.names or ():
             if name != "slot":
                 assert loaded.rows[name].tobytes() == self.memory.rows[name].tobytes(), name
@@ -337,7 +338,7 @@ def test_a_turn_that_was_begun_but_not_applied_leaves_nothing_behind() -> None:
         memory = b.storage.load()
         memory.append(*b.storage.rows_of(pending[0]))
         predictor: Any = FakePredictor(1)
-        maintain(memory, 1, b.config, 1, predictor)
+        maintain(memory, 1, b.config, predictor)
         b.reopen()  # killed here
         assert b.turn()
         b.check()

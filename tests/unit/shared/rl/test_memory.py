@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 from unittest import mock
 
@@ -22,6 +23,7 @@ from hypothesis.stateful import (
 from shared.config import MemoryConfig
 from shared.rl import memory as memory_module
 from shared.rl.memory import MIRROR, SAMPLE, ReplayMemory, SampleStore
+from shared.rl.retention.rmm import candidates_by_action, force_candidates
 from shared.rl.turn import maintain
 
 
@@ -119,7 +121,7 @@ class MemoryMachine(RuleBasedStateMachine):
     @rule(data=st.data())
     def force(self, data: st.DataObject) -> None:
         ids = data.draw(st.lists(st.sampled_from([s["id"] for s in self.model]), max_size=3))
-        self.memory.force_candidates(np.array(ids, np.uint64))
+        force_candidates(self.memory, np.array(ids, np.uint64))
         for s in self.model:
             if s["id"] in ids:
                 s["forced"] = s["candidate"] = True
@@ -137,7 +139,7 @@ class MemoryMachine(RuleBasedStateMachine):
         """Discard, and equalise when due."""
         config = MemoryConfig(strategy=strategy, rule=marking, equalise_every=int(equalise))
         predictor: Any = FakePredictor(self.version)
-        done = maintain(self.memory, 1, config, self.percent, predictor)
+        done = maintain(self.memory, 1, config, predictor)
         samples = [
             oracles.Sample(s["id"], s["action"], s["image"][:15], s["candidate"], s["forced"])
             for s in self.model
@@ -150,7 +152,7 @@ class MemoryMachine(RuleBasedStateMachine):
         self.model = [s for s in self.model if s["id"] in kept]
         for s in self.model:
             s["candidate"] = kept[s["id"]].candidate
-        self.percent = done.discarded.threshold_percent
+        self.percent = done.discarded.told["threshold_percent"]
         assert self.percent == expected.percent
         assert len(self.memory) <= self.capacity
         assert done.equalised == (equalise and bool(self.model))
@@ -193,8 +195,10 @@ class MemoryMachine(RuleBasedStateMachine):
         ids = np.array([*known, missing], np.uint64)
         more = [np.zeros(len(ids), np.float32)] if what == "set_rewards" else []
         before = snapshot(self.memory)
+        forcing = partial(force_candidates, self.memory)
+        change = forcing if what == "force_candidates" else getattr(self.memory, what)
         with pytest.raises(KeyError):
-            getattr(self.memory, what)(ids, *more)
+            change(ids, *more)
         assert snapshot(self.memory) == before
 
     @precondition(lambda self: self.model)
@@ -225,7 +229,7 @@ class MemoryMachine(RuleBasedStateMachine):
         images = memory.images(np.arange(len(memory)))
         assert [i.tobytes() for i in images] == [s["image"] for s in self.model]
         assert memory.by_action() == [sum(s["action"] == a for s in self.model) for a in range(3)]
-        assert memory.candidates_by_action() == [
+        assert candidates_by_action(memory) == [
             sum(s["candidate"] and s["action"] == a for s in self.model) for a in range(3)
         ]
         # rounding differs from the model's; both go on from the same numbers

@@ -7,28 +7,24 @@ from typing import Any, Literal
 import numpy as np
 import oracles
 import pytest
-from builders import image_with
+from builders import FakePredictor, image_with
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import BITS_OF_PERCENT, Sample
 
 from shared.config import MemoryConfig
-from shared.rl import retention
 from shared.rl.memory import SAMPLE, ReplayMemory
-from shared.rl.retention import Discard, discard, normm_keep, rmm_share, scaled_count
+from shared.rl.retention import rmm
+from shared.rl.retention.normm import normm_keep
+from shared.rl.retention.rmm import (
+    candidates_by_action,
+    force_candidates,
+    rmm_share,
+    scaled_count,
+)
+from shared.rl.retention.strategy import Discard, Situation, discard
 
 FAST = settings(deadline=None, max_examples=80, derandomize=True)
-
-
-class Describer:
-    """The first 15 bytes of an image are its descriptor; counts the images it is asked for."""
-
-    def __init__(self) -> None:
-        self.calls: list[int] = []
-
-    def __call__(self, images: np.ndarray) -> np.ndarray:
-        self.calls.append(len(images))
-        return images.reshape(len(images), -1)[:, :15].copy()
 
 
 class Bench:
@@ -38,9 +34,8 @@ class Bench:
         self.config = MemoryConfig(capacity=max(capacity, 30), **config)
         self.memory = ReplayMemory(capacity)
         self.samples: list[Sample] = []
-        self.describe = Describer()
+        self.network = FakePredictor()
         self.percent = self.config.threshold_percent
-        self.version = 1
         self._next_id = 1
 
     def add(self, *kinds: tuple[int, int]) -> None:
@@ -58,7 +53,7 @@ class Bench:
         self.memory.append(rows, np.frombuffer(b"".join(images), np.uint8).reshape(shape))
 
     def force(self, *ids: int) -> None:
-        self.memory.force_candidates(np.array(ids, np.uint64))
+        force_candidates(self.memory, np.array(ids, np.uint64))
         for sample in self.samples:
             if sample.id in ids:
                 sample.forced = sample.candidate = True
@@ -80,11 +75,11 @@ class Bench:
         )
         capacity, percent = self.memory.capacity, self.percent
         decreed = {s.id for s in self.samples if s.forced}
-        found = discard(self.memory, self.config, self.percent, self.describe, self.version)
+        found = discard(Situation(self.memory, 0, self.config, self.network))
         assert [int(i) for i in found.ids] == expected.removed
-        assert found.recomputed == expected.recomputed
-        assert found.last_resort == expected.last_resort
-        assert found.threshold_percent == expected.percent
+        assert found.told["recomputed"] == expected.recomputed
+        assert found.told["last_resort"] == expected.last_resort
+        assert found.told["threshold_percent"] == expected.percent
         assert found.capacity == self.memory.capacity == expected.capacity
         assert [int(i) for i in self.memory.ids] == [s.id for s in self.samples]
         assert [bool(c) for c in self.memory.rows["candidate"]] == [
@@ -94,7 +89,7 @@ class Bench:
         self.memory.check_valid()
         self._check_quotas(before)
         self._check_growth(found, capacity, percent, decreed)
-        self.percent = found.threshold_percent
+        self.percent = found.told["threshold_percent"]
         return found
 
     def _check_growth(self, found: Discard, capacity: int, percent: int, decreed: set[int]) -> None:
@@ -102,13 +97,13 @@ class Bench:
         most = max(capacity, self.config.capacity_max)
         assert capacity <= found.capacity <= most
         if found.capacity > capacity:
-            assert found.recomputed
-        if found.threshold_percent > percent or (
-            found.last_resort and self.config.strategy == "rmm"
+            assert found.told["recomputed"]
+        if found.told["threshold_percent"] > percent or (
+            found.told["last_resort"] and self.config.strategy == "rmm"
         ):
             assert found.capacity == most
-        if found.threshold_percent > percent:
-            assert (found.capacity, found.threshold_percent) == (capacity, percent + 1)
+        if found.told["threshold_percent"] > percent:
+            assert (found.capacity, found.told["threshold_percent"]) == (capacity, percent + 1)
         kept = self.memory.rows[["id", "candidate", "forced"]].tolist()
         assert {i for i, candidate, forced in kept if candidate and forced} == decreed - {
             int(i) for i in found.ids
@@ -202,7 +197,7 @@ def test_repeated_discards_equal_the_rules(
             bench.force(*[s.id for s in bench.samples])
         if data.draw(st.integers(0, 4)) == 0:
             bench.memory.set_capacity(data.draw(st.integers(3, 60)))
-        bench.version += data.draw(st.integers(0, 1))
+        bench.network.version += data.draw(st.integers(0, 1))
         bench.discard()
 
 
@@ -214,14 +209,14 @@ def test_a_memory_that_holds_exactly_its_capacity_is_left_alone(strategy: str) -
     bench = Bench(30, strategy=strategy)
     bench.add(*[(0, 0)] * 30)
     found = bench.discard()
-    assert (len(found.ids), found.recomputed, bench.describe.calls) == (0, False, [])
+    assert (len(found.ids), found.told["recomputed"], bench.network.described) == (0, False, [])
 
 
 def test_normm_drops_the_oldest_whatever_their_action() -> None:
     bench = Bench(100, strategy="normm")
     bench.add(*[(i % 2, i) for i in range(104)])
     assert list(bench.discard().ids) == [1, 2, 3, 4, 5]
-    assert bench.describe.calls == []
+    assert bench.network.described == []
 
 
 def test_rmm_touches_only_actions_above_one_third() -> None:
@@ -238,19 +233,19 @@ def test_oldest_candidates_go_first_and_dissimilar_old_samples_stay() -> None:
     bench.add(*unique, *[(0, 0)] * 26)
     found = bench.discard()
     assert list(found.ids) == list(range(6, 28))
-    assert found.last_resort == 0
+    assert found.told["last_resort"] == 0
     assert list(bench.memory.ids[:5]) == [1, 2, 3, 4, 5]
 
 
 def test_marks_are_computed_anew_only_when_too_few_candidates_are_left() -> None:
     bench = Bench(300, recompute_below=10)
     bench.add(*[(0, 0)] * 101, *[(1, 0)] * 100, *[(2, 0)] * 100)
-    assert bench.discard().recomputed
+    assert bench.discard().told["recomputed"]
     searches = []
     for i in range(46):
         bench.add((0, (2**11 - 1) << 2 * i), (0, (2**11 - 1) << 2 * i + 1))
-        left = bench.memory.candidates_by_action()[0]
-        searches.append((left, bench.discard().recomputed))
+        left = candidates_by_action(bench.memory)[0]
+        searches.append((left, bench.discard().told["recomputed"]))
     assert searches == [(left, False) for left in range(98, 8, -2)] + [(8, True)]
 
 
@@ -260,7 +255,7 @@ def test_a_search_begins_below_the_limit_of_candidates(candidates: int, expected
     bench.add(*[(0, 0)] * 101, *[(1, 0)] * 100, *[(2, 0)] * 100)  # two of action 0 must go
     bench.force(*range(1, candidates + 1))
     found = bench.discard()
-    assert found.recomputed is expected
+    assert bool(found.told["recomputed"]) is expected
     assert list(found.ids) == [1, 2]
 
 
@@ -274,14 +269,14 @@ def test_candidates_by_decree_count_for_the_action_that_must_discard(
     bench.add(*far, *[(0, 0)] * 21, *unlike(1, 25), *[(1, 0)] * 100, *[(2, 0)] * 100)
     bench.force(*range(1, forced + 1))
     found = bench.discard()
-    assert (found.recomputed, found.capacity) == (True, capacity)
+    assert (found.told["recomputed"], found.capacity) == (True, capacity)
 
 
 def test_few_candidates_of_an_action_below_its_quota_do_not_trigger_a_search() -> None:
     bench = Bench(300, recompute_below=10)
     bench.add(*[(0, 0)] * 101, *[(1, 0)] * 100, *[(2, 0)] * 100)
     bench.force(*range(1, 30))
-    assert not bench.discard().recomputed
+    assert not bench.discard().told["recomputed"]
 
 
 def test_a_search_comes_before_the_last_resort() -> None:
@@ -290,7 +285,7 @@ def test_a_search_comes_before_the_last_resort() -> None:
     bench.add(*[(0, 0)] * 31)
     bench.force(1, 2)
     found = bench.discard()
-    assert (found.recomputed, found.last_resort, len(found.ids)) == (True, 0, 22)
+    assert (found.told["recomputed"], found.told["last_resort"], len(found.ids)) == (True, 0, 22)
 
 
 def test_what_candidates_cannot_cover_goes_by_age_and_is_counted() -> None:
@@ -298,7 +293,7 @@ def test_what_candidates_cannot_cover_goes_by_age_and_is_counted() -> None:
     bench.add(*[(0, (2**11 - 1) << (3 * i)) for i in range(31)])
     bench.force(20, 25)
     found = bench.discard()
-    assert found.last_resort == 20
+    assert found.told["last_resort"] == 20
     assert list(found.ids) == [*range(1, 22), 25]  # 20 and 25, then the 20 oldest others
     assert len(bench.memory) == 9
 
@@ -308,7 +303,7 @@ def test_forced_marks_outlive_a_recomputation_and_go_with_their_samples() -> Non
     bench.add(*[(0, (2**11 - 1) << i) for i in range(100)])
     bench.add(*[(1, 0)] * 201)
     bench.force(7, 150)
-    assert bench.discard().recomputed
+    assert bench.discard().told["recomputed"]
     assert bench.memory.rows["forced"][bench.memory.ranks(np.array([7], np.uint64))].all()
     bench.memory.set_capacity(150)
     bench.discard()
@@ -319,17 +314,17 @@ def test_descriptors_of_the_same_version_are_made_once() -> None:
     bench = Bench(30, recompute_below=30)
     bench.add(*[(0, 0)] * 31)
     bench.discard()
-    assert bench.describe.calls == [31]
+    assert bench.network.described == [31]
     kept = len(bench.memory)
     bench.add(*[(0, 0)] * (31 - kept))
-    assert bench.discard().recomputed
-    assert bench.describe.calls == [31, 31 - kept]
+    assert bench.discard().told["recomputed"]
+    assert bench.network.described == [31, 31 - kept]
     assert set(bench.memory.rows["described_by"]) == {1}
-    bench.version = 2
+    bench.network.version = 2
     kept = len(bench.memory)
     bench.add(*[(0, 0)] * (31 - kept))
     bench.discard()
-    assert bench.describe.calls == [31, 31 - kept, 31]
+    assert bench.network.described == [31, 31 - kept, 31]
     assert set(bench.memory.rows["described_by"]) == set(bench.memory.rows["marked_by"]) == {2}
 
 
@@ -337,7 +332,7 @@ def test_a_recomputation_renews_the_marks_of_all_actions() -> None:
     bench = Bench(30)
     bench.add(*[(1, 0)] * 5, *[(0, 0)] * 26)
     bench.discard()
-    assert bench.memory.candidates_by_action()[1] == 4
+    assert candidates_by_action(bench.memory)[1] == 4
 
 
 def test_similarity_never_crosses_actions() -> None:
@@ -359,14 +354,14 @@ def test_thresholds_in_bits_go_1_2_3_4_6_7_8_and_stay_there(
         used.append(bits)
         return real(descriptors, bits, rule)
 
-    real = retention.similar_to_newer
-    monkeypatch.setattr(retention, "similar_to_newer", spy)
+    real = rmm.similar_to_newer
+    monkeypatch.setattr(rmm, "similar_to_newer", spy)
     rng = np.random.default_rng(1)
     bench = Bench(30)
     for _ in range(9):
         n = 31 - len(bench.memory)
         bench.add(*[(0, int.from_bytes(rng.bytes(15), "big")) for _ in range(n)])
-        assert bench.discard().recomputed
+        assert bench.discard().told["recomputed"]
     assert used[::3] == [1, 2, 3, 4, 6, 7, 8, 8, 8]
     assert bench.percent == 7
 
@@ -383,20 +378,20 @@ def test_the_threshold_grows_when_not_more_than_the_limit_is_found(
     bench.add(*[(0, (2**11 - 1) << i) for i in range(101 - found)], *[(0, 0)] * found)
     bench.add((0, 0), *[(1, 0)] * 100, *[(2, 0)] * 100)
     result = bench.discard()
-    assert (result.recomputed, result.threshold_percent) == (True, percent)
+    assert (result.told["recomputed"], result.told["threshold_percent"]) == (True, percent)
 
 
 def test_few_candidates_of_an_action_that_need_not_discard_do_not_raise_the_threshold() -> None:
     bench = Bench(300, recompute_below=400, raise_at_most=20)
     bench.add(*[(0, 0)] * 150, *[(1, (2**11 - 1) << i) for i in range(100)], *[(2, 0)] * 100)
-    assert bench.discard().threshold_percent == 1
+    assert bench.discard().told["threshold_percent"] == 1
 
 
 def test_one_action_that_must_discard_and_lacks_candidates_is_enough_to_raise() -> None:
     bench = Bench(300, recompute_below=400, raise_at_most=20)
     bench.add(*[(0, 0)] * 150, *[(1, (2**11 - 1) << (i % 100)) for i in range(105)])
     bench.add(*[(2, 0)] * 60)
-    assert bench.discard().threshold_percent == 2
+    assert bench.discard().told["threshold_percent"] == 2
 
 
 def test_the_threshold_is_raised_once_per_discard_and_capped() -> None:
@@ -413,7 +408,7 @@ def test_without_a_search_the_threshold_stays() -> None:
     bench.add(*[(0, 0)] * 101, *[(1, 0)] * 100, *[(2, 0)] * 100)
     bench.force(1, 2, 3)
     found = bench.discard()
-    assert (found.recomputed, found.threshold_percent) == (False, 1)
+    assert (found.told["recomputed"], found.told["threshold_percent"]) == (False, 1)
 
 
 # ------------------------------------------------------------------------- capacity
@@ -463,10 +458,10 @@ def test_a_failed_search_makes_the_memory_grow_at_once_and_nothing_goes() -> Non
     bench = Bench(90, capacity_max=110, capacity_step=10)
     bench.add(*unlike(1, 91))
     found = bench.discard()
-    assert (found.capacity, found.threshold_percent, len(found.ids)) == (100, 1, 0)
-    assert found.recomputed
+    assert (found.capacity, found.told["threshold_percent"], len(found.ids)) == (100, 1, 0)
+    assert found.told["recomputed"]
     bench.add(*unlike(2, 9))
-    assert not bench.discard().recomputed  # holds exactly N
+    assert not bench.discard().told["recomputed"]  # holds exactly N
     bench.add(*unlike(3, 1))
     assert (bench.discard().capacity, len(bench.memory)) == (110, 101)
 
@@ -477,7 +472,9 @@ def test_the_threshold_rises_only_when_the_memory_may_not_grow_any_more() -> Non
     for i in range(5):
         bench.add(*unlike(i, bench.memory.capacity + 1 - len(bench.memory)))
         found = bench.discard()
-        steps.append((found.capacity, found.threshold_percent, found.last_resort > 0))
+        steps.append(
+            (found.capacity, found.told["threshold_percent"], found.told["last_resort"] > 0)
+        )
     assert steps == [
         (100, 1, False), (105, 1, False), (105, 2, True), (105, 3, True), (105, 3, True),
     ]  # fmt: skip
@@ -487,14 +484,14 @@ def test_a_search_that_finds_enough_leaves_the_capacity_alone() -> None:
     bench = Bench(90, capacity_max=200, capacity_step=10)
     bench.add(*[(0, 0)] * 91)
     found = bench.discard()
-    assert (found.recomputed, found.capacity, len(bench.memory)) == (True, 90, 29)
+    assert (found.told["recomputed"], found.capacity, len(bench.memory)) == (True, 90, 29)
 
 
 def test_a_memory_grows_by_further_steps_rather_than_discarding_by_age() -> None:
     bench = Bench(90, capacity_max=200, capacity_step=10)
     bench.add(*unlike(1, 115))
     found = bench.discard()
-    assert (found.capacity, len(found.ids), found.last_resort) == (120, 0, 0)
+    assert (found.capacity, len(found.ids), found.told["last_resort"]) == (120, 0, 0)
 
 
 def test_candidates_that_cannot_cover_what_must_go_make_the_memory_grow_too() -> None:
@@ -502,7 +499,11 @@ def test_candidates_that_cannot_cover_what_must_go_make_the_memory_grow_too() ->
     bench = Bench(90, capacity_max=200, capacity_step=10, raise_at_most=5)
     bench.add(*unlike(1, 71), *[(0, 0)] * 20)
     found = bench.discard()
-    assert (found.capacity, found.threshold_percent, found.last_resort) == (100, 1, 0)
+    assert (found.capacity, found.told["threshold_percent"], found.told["last_resort"]) == (
+        100,
+        1,
+        0,
+    )
 
 
 def test_normm_never_grows() -> None:
@@ -534,10 +535,10 @@ def test_samples_marked_by_decree_go_before_the_memory_grows() -> None:
     bench.force(*range(1, 91))
     bench.add(*unlike(2, 1))
     found = bench.discard()
-    assert (list(found.ids), found.recomputed) == (list(range(1, 63)), False)
+    assert (list(found.ids), found.told["recomputed"]) == (list(range(1, 63)), False)
     bench.add(*unlike(3, 62))
     found = bench.discard()  # 28 marks are left where 62 must go
-    assert (found.recomputed, found.capacity, found.last_resort) == (True, 100, 0)
+    assert (found.told["recomputed"], found.capacity, found.told["last_resort"]) == (True, 100, 0)
     assert bench.memory.rows["forced"].sum() == 28
 
 

@@ -1,0 +1,139 @@
+"""The interface of a strategy of retention, and the discard that every strategy takes part in."""
+
+# ruff: noqa: ARG002  (defaults of an interface)
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from shared.rl.retention.table import STRATEGIES, TELLS
+
+if TYPE_CHECKING:
+    from shared.config import MemoryConfig
+    from shared.rl.engine import Progress
+    from shared.rl.memory import Ids, Images, ReplayMemory
+
+Rows = npt.NDArray[np.void]
+
+
+class Network(Protocol):
+    """The target network as far as strategies use it. A `Predictor` is one."""
+
+    version: int
+
+    def descriptors(
+        self, images: Images, progress: Progress | None = None
+    ) -> npt.NDArray[np.uint8]:
+        """Return the packed 120-bit descriptors of images: uint8 [n, 15]."""
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What is there when a memory may have to discard."""
+
+    memory: ReplayMemory
+    number: int
+    """Global episode number, 0 while the memory is filled."""
+    config: MemoryConfig
+    network: Network
+    progress: Progress | None = None
+    """Called with the images looked at so far, and in all."""
+
+
+@dataclass(frozen=True)
+class Discard:
+    """What one discard did."""
+
+    capacity: int
+    """N from now on: a strategy may let the memory grow (E32)."""
+    ids: Ids = field(default_factory=lambda: np.zeros(0, np.uint64))
+    """Removed insertion numbers, ascending."""
+    marked: bool = False
+    """Whether the strategy changed its own columns."""
+    keep: Mapping[str, int] = field(default_factory=dict)
+    """Whole numbers that the strategy needs again at its next discard."""
+    told: Mapping[str, int] = field(default_factory=dict)
+    """What a strategy tells of this discard, by name. `discard` returns all of `TELLS`."""
+    warning: str = ""
+    """What an operator should know; empty if nothing."""
+
+
+class Strategy(ABC):
+    """What is there -> what goes. Only `choose` must be written."""
+
+    columns: ClassVar[tuple[tuple[Any, ...], ...]] = ()
+    """Values of its own for each sample: (name, dtype) or (name, dtype, shape). They are 0 of new
+    samples. Memory, disk and snapshots carry them, also while another strategy is in force."""
+
+    def begin(self, config: MemoryConfig) -> dict[str, int]:
+        """Return the numbers to keep that the first discard begins with."""
+        return {}
+
+    def prepare(self, there: Situation) -> bool:
+        """Change its own columns, whether or not the memory is full; return whether it did."""
+        return False
+
+    @abstractmethod
+    def choose(self, there: Situation) -> Discard:
+        """Choose what goes from a memory that holds more than N samples (A12).
+
+        At most N must remain. Only its own columns of the memory may be changed here; `memory.kept`
+        holds the numbers it kept.
+        """
+
+    def state(self, memory: ReplayMemory) -> dict[str, int]:
+        """Return whole numbers that show an operator how it stands."""
+        return {}
+
+    def invariants(self, rows: Rows) -> Iterator[tuple[bool, str]]:
+        """Yield what must be true of its columns: whether it is, and its name."""
+        yield from ()
+
+
+def beyond(before: int, total: int, progress: Progress | None) -> Progress | None:
+    """Return what reports the progress of a part as that of the whole."""
+    return None if progress is None else lambda done, _: progress(before + done, total)
+
+
+def strategy(name: str) -> Strategy:
+    """Return the strategy of this name. Raises KeyError for an unknown one."""
+    found: Strategy = import_module(f"{__package__}.{STRATEGIES[name].module}").STRATEGY
+    return found
+
+
+def columns() -> list[tuple[Any, ...]]:
+    """Return the columns of all strategies, in the order of the table."""
+    return [column for name in STRATEGIES for column in strategy(name).columns]
+
+
+def begin(config: MemoryConfig) -> dict[str, int]:
+    """Return what all strategies begin with under these settings."""
+    return {
+        key: value for name in STRATEGIES for key, value in strategy(name).begin(config).items()
+    }
+
+
+def discard(there: Situation) -> Discard:
+    """Reduce a memory that holds more than N samples (A12, A27); remove nothing otherwise.
+
+    Rows, capacity and kept numbers of the memory are changed.
+    """
+    memory, chosen = there.memory, strategy(there.config.strategy)
+    memory.kept = {**begin(there.config), **memory.kept}
+    prepared = chosen.prepare(there)
+    done = Discard(memory.capacity)
+    if len(memory) > memory.capacity:
+        done = chosen.choose(there)
+    if len(done.ids):
+        memory.remove(done.ids)
+    memory.set_capacity(done.capacity)
+    memory.kept |= done.keep
+    told = {**{name: memory.kept.get(name, 0) for name in TELLS}, **done.told}
+    return replace(done, marked=done.marked or prepared, told=told)
