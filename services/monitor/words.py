@@ -8,7 +8,6 @@ from shared.facts import SHORT_NAMES
 from shared.messages import LearnerState, ReplayState
 
 
-
 def duration(seconds: float) -> str:
     """A time span as h:mm:ss."""
     minutes, rest = divmod(int(seconds), 60)
