@@ -77,8 +77,8 @@ class Learner(Protocol):
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What to run."""
+class BaselinePlan:
+    """A run of the baseline, as the command line asks for it."""
 
     config: Config
     scale: Scale
@@ -126,7 +126,7 @@ class DistanceReward(gymnasium.Wrapper[Image, np.int64, Image, np.int64]):
 class Dqn:
     """DQN of Stable-Baselines3 as a learner."""
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: BaselinePlan) -> None:
         from experiments.baseline import sb3
 
         self._sb3, config = sb3, plan.config
@@ -157,7 +157,7 @@ class Dqn:
         return self._sb3.mini_batches(self._model)
 
 
-def run(plan: Plan, learner: Learner) -> None:
+def run(plan: BaselinePlan, learner: Learner) -> None:
     """Learn, evaluate at intervals; leaves `evaluations.csv` and `run.json` as our experiments do.
 
     `seconds` is the wall time of learning alone.
@@ -187,7 +187,7 @@ def run(plan: Plan, learner: Learner) -> None:
     write_atomically(plan.out / "run.json", _told(plan, learner, seconds, began))
 
 
-def _told(plan: Plan, learner: Learner, seconds: float, began: str) -> bytes:
+def _told(plan: BaselinePlan, learner: Learner, seconds: float, began: str) -> bytes:
     """What was run, with the names that reports of experiments read."""
     made, counts = machine(), {"actions": learner.actions, "train_steps": learner.train_steps}
     stage = {
@@ -235,7 +235,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def planned(words: Sequence[str]) -> Plan:
+def planned(words: Sequence[str]) -> BaselinePlan:
     """The plan that the command line asks for. Raises ConfigError."""
     parser = argparse.ArgumentParser(
         prog="python -m experiments.baseline.dqn", description=(__doc__ or "").split("\n")[0]
@@ -268,7 +268,7 @@ def planned(words: Sequence[str]) -> Plan:
         del told[told.index("--out") : told.index("--out") + 2]
     command = shlex.join(["python", "-m", "experiments.baseline.dqn", *told])
     factors = (like.mini.factor, like.mini.memories_by) if given.scale == "mini" else (1, 1)
-    return Plan(
+    return BaselinePlan(
         config, given.scale, *factors, given.actions,
         given.reward, given.starts, given.drive_actions, given.out, command,
     )  # fmt: skip

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from experiments.baseline import dqn
-from experiments.baseline.dqn import EVALUATIONS, DistanceReward, Plan, planned
+from experiments.baseline.dqn import EVALUATIONS, BaselinePlan, DistanceReward, planned
 from experiments.drives.choosers import Chooser, uniform
 from experiments.environment import CorridorEnv
 from experiments.plans.plan import load_plan, stage_config
@@ -38,7 +38,7 @@ class Pretender:
         return self.actions // 4
 
 
-def plan(out: Path) -> Plan:
+def plan(out: Path) -> BaselinePlan:
     words = ["--actions", "207", "--starts", "1", "--drive-actions", "30", "--out", str(out)]
     return planned(words)
 
