@@ -193,14 +193,16 @@ class Actor:
         return self._expected == place and newest.sequence == observation.sequence
 
     def _ending(self, observation: Observation) -> Ending | None:
-        """How this observation ends the open episode, if it does (A9, E6, E10, E11)."""
+        """How this observation ends the open episode, if it does (A9, E6, E10, E11, E42)."""
         if not len(self.open):
             return None
         continues = self._expected == (observation.life, observation.sequence)
-        if observation.interruption or not continues:
+        if not continues:
             return "interrupted"
-        if observation.bump:
+        if observation.bump and observation.interruption != "moved":  # a motion is no action
             return "bump"
+        if observation.interruption:
+            return "interrupted"
         return "full" if self.open.full else None
 
     def _drop(self, *, samples: int, episodes: int) -> None:

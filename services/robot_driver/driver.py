@@ -187,23 +187,28 @@ class Driver:
             return
         if bump and self._config.robot.recovery == "back-off":
             self._recover()
-        if executed:
-            self.sequence, self.attempt = self.sequence + 1, 0
-        else:
-            self.attempt += 1
+        self._count(executed=executed)
         self.state = "waiting"
 
     def look_again(self, interruption: Interruption) -> None:
-        """The observation was not answered by motion: take a fresh one under the same number."""
+        """The observation was not answered by motion: take a fresh one under the same number.
+
+        An earlier `moved` stays: it tells that the bump, if there is one, was no action's (E42).
+        """
         self.attempt += 1
-        self._interruption = interruption or self._interruption
+        if self._interruption != "moved":
+            self._interruption = interruption or self._interruption
         self.state = "waiting"
 
     def block(self, reason: str, *, bump: bool = False) -> None:
         """The robot is not fit to drive: stand still until `fit`, then look anew.
 
-        A bump at that moment is counted and not recovered from: nobody knows when it goes on.
+        A bump at that moment is counted and not recovered from: nobody knows when it goes on. It
+        ends the action in force, which counts as executed, before the robot is blocked (E42).
         """
+        if bump and not self._motion:
+            self._bump, self._interruption = True, ""
+            self._count(executed=self.state == "driving")
         self.halt()
         self.blocks += 1
         self.bumps += int(bump)
@@ -369,6 +374,13 @@ class Driver:
         faults = getattr(self._robot, "faults", None)  # only real robots have them
         most = faults.most_common(MAX_FAULTS) if faults else ()
         return tuple(Fault(name=name[:64], count=count) for name, count in most)
+
+    def _count(self, *, executed: bool) -> None:
+        """Number the next observation: an executed action counts, anything else is a new look."""
+        if executed:
+            self.sequence, self.attempt = self.sequence + 1, 0
+        else:
+            self.attempt += 1
 
     def _drive(self, velocity: Velocity) -> None:
         self._robot.drive(velocity)

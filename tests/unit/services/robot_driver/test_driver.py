@@ -328,6 +328,28 @@ def test_an_interruption_is_not_forgotten_by_looking_again() -> None:
     assert (driver.observe().interruption, driver.attempt) == ("estop", 3)
 
 
+def test_an_emergency_stop_after_a_bump_hides_no_bump() -> None:
+    """E42: the observation after it tells both, under the number after the action."""
+    driver, robot = make_driver(timing="realtime")
+    robot.contacts = [True]
+    driver.start(0)
+    driver.settle(driver.advance(0.02))
+    for command in ("estop", "clear"):
+        driver.command(command)  # type: ignore[arg-type]
+    seen = driver.observe()
+    assert (seen.sequence, seen.bump, seen.interruption) == (1, True, "estop")
+
+
+def test_contact_of_a_motion_stays_apart_from_an_actions_bump() -> None:
+    driver, robot = make_driver(timing="realtime")
+    assert driver.start_motion("turn-left")
+    robot.contacts = [True]
+    driver.settle(driver.advance(0.02))
+    driver.look_again("late")
+    seen = driver.observe()
+    assert (seen.sequence, seen.bump, seen.interruption) == (0, True, "moved")
+
+
 def test_halt_during_an_action_stops_it() -> None:
     driver, robot = make_driver(timing="realtime")
     driver.start(0)

@@ -325,7 +325,8 @@ def test_a_bump_on_the_action_that_fills_the_episode_is_a_bump() -> None:
     "broken",
     [
         {"interruption": "pause"},
-        {"interruption": "estop", "bump": True},
+        {"interruption": "moved", "bump": True},
+        {"bump": True, "sequence": 9},
         {"life": OTHER_LIFE},
         {"sequence": 9},
         {"sequence": 4},
@@ -343,6 +344,21 @@ def test_what_breaks_the_sequence_interrupts_the_episode(broken: dict[str, Any])
     assert (episode.dropped_samples, episode.dropped_episodes) == (4, 0)
     assert len(actor.open) == 0
     assert episode.robot_life == LIFE
+
+
+@pytest.mark.parametrize("interruption", ["estop", "pause", "late", "blocked", "restart", "world"])
+def test_a_bump_seen_together_with_an_interruption_is_settled_first(interruption: str) -> None:
+    """E42: all samples of the episode are complete; what follows begins a new one."""
+    (actor, _), replay = make_actor(), Replay()
+    actor.begin(progress(), observe(0))
+    for sequence in range(7):
+        drive(actor, replay, observe(sequence))
+    drive(actor, replay, observe(7, attempt=1, bump=True, interruption=interruption))
+    (episode,) = replay.episodes
+    assert (episode.ended, episode.bump, sequences(episode)) == ("bump", True, list(range(7)))
+    assert episode.dropped_samples == 0
+    assert np.frombuffer(episode.sample_rewards, "<f4")[-1] == -1.0
+    assert [step.sequence for step in actor.open.steps] == [7]
 
 
 def test_an_action_that_was_never_executed_is_neither_sample_nor_action() -> None:

@@ -225,6 +225,10 @@ def test_a_bump_as_it_becomes_unfit_is_counted_and_not_recovered_from(
     assert caught.value.contact
     driver.block(str(caught.value), bump=caught.value.contact)
     assert (driver.bumps, driver.recoveries) == (1, 0)
+    link.low = link.pressed = False
+    wait_until(driver.fit, 20, "it is fit again")
+    seen = driver.observe()
+    assert (seen.sequence, seen.bump, seen.interruption) == (1, True, "blocked")  # E42
 
 
 def test_a_restarted_driver_of_a_real_robot_tells_of_it(robot: HardwareRobot) -> None:
