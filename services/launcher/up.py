@@ -146,9 +146,14 @@ def reachable(listen: str) -> str:
 
 @contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
-    """An event that Ctrl-C, SIGTERM and a closed terminal set; handlers are put back at the end."""
+    """An event that Ctrl-C, SIGTERM and a closed terminal set; handlers are put back at the end.
+
+    Where a closed terminal is ignored already, as under nohup, it stays ignored.
+    """
     stop = threading.Event()
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
     before = {number: signal.signal(number, lambda *_: stop.set()) for number in numbers}
     try:
         yield stop

@@ -5,6 +5,7 @@ Arguments: run folder, then Python sources of the children. Each child is tether
 
 from __future__ import annotations
 
+import signal
 import sys
 from pathlib import Path
 
@@ -17,6 +18,7 @@ TETHERED = "from services.launcher.tether import tether; tether()\n"
 
 def main() -> int:
     folder, *sources = sys.argv[1:]
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run under nohup
     real_specs = up.child_specs
 
     def with_fakes(

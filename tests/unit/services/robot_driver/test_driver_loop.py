@@ -311,7 +311,7 @@ def test_a_closed_terminal_is_a_clean_end() -> None:
     )
     for ignored, said in ((False, "True SIGHUP"), (True, "False")):
         text = code if not ignored else code.replace("10.0", "0.1")
-        if ignored:  # as under nohup
-            text = f"import signal; signal.signal({int(signal.SIGHUP)}, signal.SIG_IGN)\n{text}"
+        before = "SIG_IGN" if ignored else "SIG_DFL"  # as under nohup; as in a terminal
+        text = f"import signal; signal.signal(signal.SIGHUP, signal.{before})\n{text}"
         done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True)
         assert done.stdout.startswith(said), done.stderr
