@@ -19,7 +19,7 @@ from statistics import median
 from benchmarks.frame import Bar, Mode, mode_of, report, rounds_of, table
 from experiments.single_process import SingleProcess
 from services.launcher.supervisor import ChildSpec, Supervisor
-from services.launcher.up import STAGES, child_specs, free_endpoint
+from services.launcher.up import child_specs, free_endpoint
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import load_world
 from shared import settings
@@ -87,7 +87,7 @@ def more_robots(specs: list[ChildSpec], robot: str) -> ChildSpec:
     """A further simulated robot of the same run."""
     driver = next(spec for spec in specs if spec.name == "driver")
     command = (*driver.command, f"--set=robot.id={robot}")
-    return ChildSpec(f"driver-{robot}", command, STAGES["driver"])
+    return ChildSpec(f"driver-{robot}", command, driver.stage)
 
 
 def connected(config: Config) -> Bus:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from services.launcher.supervisor import ChildSpec, Supervisor
-from services.launcher.up import STAGES, child_specs
+from services.launcher.up import child_specs
 from services.replay.storage import Storage
 from shared import settings
 from shared.bus import Bus
@@ -101,7 +101,7 @@ def another_driver(specs: list[ChildSpec], robot: str) -> ChildSpec:
     """A further simulated robot of the same run."""
     driver = next(spec for spec in specs if spec.name == "driver")
     command = (*driver.command, f"--set=robot.id={robot}")
-    return ChildSpec(f"driver-{robot}", command, STAGES["driver"])
+    return ChildSpec(f"driver-{robot}", command, driver.stage)
 
 
 def bus(config: Config, *, shared_memory: bool = True) -> Bus:

@@ -6,7 +6,6 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -15,14 +14,15 @@ from typing import Self
 
 from waiting import wait_until
 
+from services import processes
 from shared import settings
 from shared.bus import Bus, Inbox
 from shared.config import Config
 from shared.keys import LEARNER_STATE, REPLAY_STATE
 from shared.messages import LearnerState, Message, ReplayState
 
-SERVICES = ("replay", "learner", "actor", "driver")
-ALL = ("router", *SERVICES)
+SERVICES = tuple(process.name for process in processes.SERVICES)
+ALL = tuple(process.name for process in processes.PROCESSES)
 
 
 def free_port() -> int:
@@ -93,7 +93,7 @@ class Cluster:
 
     def _launch(self, name: str, service: str, *options: str) -> None:
         self._forget(name)
-        command = [sys.executable, "-m", "services.cli", service, *options]
+        command = [*processes.COMMAND, service, *options]
         environment = {k: v for k, v in os.environ.items() if not k.startswith("CORRIDOR_")}
         self.folder.mkdir(parents=True, exist_ok=True)
         with (self.folder / f"{name}.out").open("ab") as output:

@@ -100,5 +100,5 @@ class ActorLoop:
             return
         self._next_beat_s = now_s + self._me.config.bus.heartbeat_s
         for robot, session in self._sessions.items():
-            state = session.state().model_copy(update={"undecodable": self._inbox.refused_total})
+            state = session.heartbeat(self._inbox.refused_total)
             self._me.bus.publish(ACTOR_STATE, state, robot)

@@ -130,8 +130,12 @@ class Session:
         self._observation = None
         self._publish(action)
 
-    def state(self) -> ActorState:
-        """The heartbeat."""
+    def heartbeat(self, undecodable: int) -> ActorState:
+        """What the actor tells of this robot.
+
+        Args:
+            undecodable: messages the actor could not take, of all robots together.
+        """
         now_s, (then_s, count) = time.monotonic(), self._counted
         rate = (self.actor.actions - count) / max(now_s - then_s, 1e-6)
         self._counted = (now_s, self.actor.actions)
@@ -150,7 +154,7 @@ class Session:
             dropped_samples=self.actor.dropped_samples,
             dropped_episodes=self.actor.dropped_episodes,
             resent_episodes=self.resent_episodes,
-            undecodable=0,
+            undecodable=undecodable,
             values=action.values if action else (0.0,) * ACTION_COUNT,
         )
 

@@ -8,12 +8,12 @@ from typing import Annotated
 import typer
 
 from services.cli.options import (
-    ConfigFile,
-    Endpoint,
-    Run,
-    RunDir,
-    Set,
-    import_role,
+    ConfigOption,
+    EndpointOption,
+    RunDirOption,
+    RunOption,
+    SetOption,
+    import_installed,
     load,
     reach,
 )
@@ -37,11 +37,11 @@ def drive(
     ],
     robot: OneRobot = None,
     actions: Annotated[int, typer.Option(min=0, help="Stop after so many; 0: never.")] = 0,
-    run: Run = None,
-    run_dir: RunDir = None,
-    endpoint: Endpoint = None,
-    config: ConfigFile = None,
-    set_: Set = None,
+    run: RunOption = None,
+    run_dir: RunDirOption = None,
+    endpoint: EndpointOption = None,
+    config: ConfigOption = None,
+    set_: SetOption = None,
 ) -> None:
     """Let a frozen network drive a robot: nothing is learnt, nothing is stored.
 
@@ -49,15 +49,18 @@ def drive(
     the run the weights come from; --config and --set stand in for a missing config.toml. --run,
     --run-dir and --endpoint tell which run the robot belongs to.
     """
-    frozen = import_role("services.commander.frozen", "actor")
+    frozen = import_installed("services.commander.frozen", "actor")
     network = load(None, config or frozen.configuration_of(weights), set_).network
-    command = import_role("services.commander.drive", "actor")
+    command = import_installed("services.commander.drive", "actor")
     there = reach(run, run_dir, endpoint)
     raise typer.Exit(command.run(there, network, weights, robot, actions, typer.echo))
 
 
 def teleop(
-    robot: OneRobot = None, run: Run = None, run_dir: RunDir = None, endpoint: Endpoint = None
+    robot: OneRobot = None,
+    run: RunOption = None,
+    run_dir: RunDirOption = None,
+    endpoint: EndpointOption = None,
 ) -> None:
     """Place a robot by keys: w a s d or arrows, space stops, e is the emergency stop, q quits.
 
@@ -74,10 +77,10 @@ def record(
     limit_mib: Annotated[
         int, typer.Option(min=1, max=1_000_000, help="End when the file is as large.")
     ] = 4096,
-    run: Run = None,
-    run_dir: RunDir = None,
-    endpoint: Endpoint = None,
-    config: ConfigFile = None,
+    run: RunOption = None,
+    run_dir: RunDirOption = None,
+    endpoint: EndpointOption = None,
+    config: ConfigOption = None,
 ) -> None:
     """Record what a run publishes and its weights as MCAP, until Ctrl-C.
 
@@ -87,7 +90,7 @@ def record(
         load(None, config, None, run, None, endpoint) if config else reach(run, run_dir, endpoint)
     )
     folder = run_dir or Path("runs") / loaded.run.name
-    service = import_role("services.recorder.service", "record")
+    service = import_installed("services.recorder.service", "record")
     from shared.service import setup_logging
 
     setup_logging("recorder", None)
@@ -101,4 +104,6 @@ def playback(
 
     Exit code 1 when an action differs, or when none could be compared.
     """
-    raise typer.Exit(import_role("services.recorder.playback", "record").run(recording, typer.echo))
+    raise typer.Exit(
+        import_installed("services.recorder.playback", "record").run(recording, typer.echo)
+    )

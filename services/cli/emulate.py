@@ -6,7 +6,14 @@ from typing import Annotated
 
 import typer
 
-from services.cli.options import ConfigFile, Preset, Set, Tethered, import_role, load
+from services.cli.options import (
+    ConfigOption,
+    PresetOption,
+    SetOption,
+    TetheredOption,
+    import_installed,
+    load,
+)
 from services.launcher.tether import tether
 from shared.errors import ConfigError
 
@@ -36,7 +43,7 @@ def emulate_robotino(
             "While it runs: POST /emulator/faults.",
         ),
     ] = None,
-    tethered: Tethered = False,
+    tethered: TetheredOption = False,
 ) -> None:
     """A Robotino's REST interface; the first line on standard output is where it listens.
 
@@ -44,7 +51,7 @@ def emulate_robotino(
     """
     if tethered:
         tether()
-    emulator = import_role("services.robot_driver.emulation.robotino", "driver")
+    emulator = import_installed("services.robot_driver.emulation.robotino", "sim")
     try:
         faults = emulator.Faults().with_texts(fault or [])
     except ValueError as error:
@@ -70,10 +77,10 @@ def emulate_ros2(
             "While it runs: `corridor emulate fault`.",
         ),
     ] = None,
-    preset: Preset = None,
-    config: ConfigFile = None,
-    set_: Set = None,
-    tethered: Tethered = False,
+    preset: PresetOption = None,
+    config: ConfigOption = None,
+    set_: SetOption = None,
+    tethered: TetheredOption = False,
 ) -> None:
     """A ROS 2 robot's Zenoh network; the first line on standard output is where it listens.
 
@@ -83,7 +90,7 @@ def emulate_ros2(
     if tethered:
         tether()
     loaded = load(preset, config, set_, others={"robot.ros2.transport": transport})
-    emulator = import_role("services.robot_driver.emulation.ros2", "sim,ros2")
+    emulator = import_installed("services.robot_driver.emulation.ros2", "sim,ros2")
     try:
         faults = emulator.Ros2Faults().with_texts(fault or [])
     except ValueError as error:
@@ -105,5 +112,5 @@ def emulate_fault(
     ] = "tcp/127.0.0.1:7448",
 ) -> None:
     """Let an emulated ROS 2 robot have a fault, or tell which it has."""
-    emulator = import_role("services.robot_driver.emulation.ros2_faults", "ros2")
+    emulator = import_installed("services.robot_driver.emulation.ros2_faults", "ros2")
     typer.echo(emulator.change_faults(endpoint, changes or []))

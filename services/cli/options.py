@@ -1,4 +1,4 @@
-"""Options that several commands share, with one meaning and one help text each, and their use."""
+"""Options that several commands share, each with one meaning and one help text, and their use."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ if TYPE_CHECKING:
 
 EXIT_CRASH, EXIT_CONFIG, EXIT_STATE = 1, 2, 3
 OURS, CHOOSE = "Configuration", "Which run"
-Preset = Annotated[
+PresetOption = Annotated[
     str | None,
     typer.Option(
         help="Preset that comes with the package (such as demo), or a .toml file.",
         rich_help_panel=OURS,
     ),
 ]
-ConfigFile = Annotated[
+ConfigOption = Annotated[
     Path | None,
     typer.Option("--config", help="TOML file; wins over the preset.", rich_help_panel=OURS),
 ]
-Set = Annotated[
+SetOption = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
@@ -37,34 +37,34 @@ Set = Annotated[
         rich_help_panel=OURS,
     ),
 ]
-Run = Annotated[
+RunOption = Annotated[
     str | None,
     typer.Option(help="Name of the run (run.name).", rich_help_panel=CHOOSE),
 ]
-RunDir = Annotated[
+RunDirOption = Annotated[
     Path | None,
     typer.Option(help="Folder of the run; default runs/<name>.", rich_help_panel=CHOOSE),
 ]
-Endpoint = Annotated[
+EndpointOption = Annotated[
     str | None,
     typer.Option(
         help="Where the router is, such as tcp/127.0.0.1:7447 (bus.endpoint).",
         rich_help_panel=CHOOSE,
     ),
 ]
-Seed = Annotated[
+SeedOption = Annotated[
     int | None,
     typer.Option(help="Seed of all random draws (run.seed).", rich_help_panel=OURS),
 ]
-Tethered = Annotated[
+TetheredOption = Annotated[
     bool,
     typer.Option("--tethered", hidden=True, help="Stop as soon as standard input closes."),
 ]
-Robot = Annotated[
+RobotOption = Annotated[
     str | None,
     typer.Option(help="Id of one robot; default: all robots of the run."),
 ]
-AtEpisode = Annotated[
+AtEpisodeOption = Annotated[
     int,
     typer.Option(
         min=0, help="Wait until the robot has finished so many episodes; 0: change it now."
@@ -94,6 +94,11 @@ def load(
     return settings.load(preset, file, [*(sets or []), *chosen], os.environ)
 
 
+def default_folder(config: Config) -> Path:
+    """The folder of a run for which none was given."""
+    return Path("runs") / config.run.name
+
+
 def reach(run: str | None, run_dir: Path | None, endpoint: str | None) -> Config:
     """How to reach a running run."""
     from services.monitor import running
@@ -101,15 +106,18 @@ def reach(run: str | None, run_dir: Path | None, endpoint: str | None) -> Config
     return running.reach(run_dir, run, endpoint, os.environ)
 
 
-def import_role(module: str, role: str) -> Any:
-    """A module of ours. Raises ConfigError when a library of this role is not installed."""
+def import_installed(module: str, extra: str) -> Any:
+    """Import a module of ours that needs the libraries of an extra.
+
+    Raises:
+        ConfigError: one of these libraries is not installed.
+    """
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] in {"experiments", "services", "shared"}:
             raise
-        extra = "sim" if role == "driver" else role
         raise ConfigError(
-            f"{role}: needs the Python package {error.name}, which is not installed: "
+            f"{extra}: needs the Python package {error.name}, which is not installed: "
             f"pip install 'corridor[{extra}]'"
         ) from error

@@ -9,15 +9,15 @@ import typer
 
 from services.cli.options import (
     EXIT_CRASH,
-    AtEpisode,
-    ConfigFile,
-    Endpoint,
-    Preset,
-    Robot,
-    Run,
-    RunDir,
-    Set,
-    import_role,
+    AtEpisodeOption,
+    ConfigOption,
+    EndpointOption,
+    PresetOption,
+    RobotOption,
+    RunDirOption,
+    RunOption,
+    SetOption,
+    import_installed,
     load,
     reach,
 )
@@ -34,7 +34,7 @@ obstacle = typer.Typer(help="Place and remove boxes where robots drive.", no_arg
 @world.command("list")
 def world_list() -> None:
     """List the worlds that come along and those in the folder worlds/."""
-    worlds = import_role("services.robot_driver.simulated.world", "driver")
+    worlds = import_installed("services.robot_driver.simulated.world", "sim")
     for name, path in worlds.world_files().items():
         loaded = worlds.read_world(path)
         x0, y0, x1, y1 = loaded.bounds
@@ -49,7 +49,7 @@ def world_render(
     out: Annotated[Path, typer.Option(help="Folder for the PNG files.")] = Path("renders"),
 ) -> None:
     """Write a top view and camera views of a world as PNG files."""
-    views = import_role("services.robot_driver.atlas.views", "driver")
+    views = import_installed("services.robot_driver.atlas.views", "sim")
     views.render(name, out)
     typer.echo(f"written to {out}")
 
@@ -57,13 +57,13 @@ def world_render(
 @world.command("check")
 def world_check(
     name: WorldName,
-    preset: Preset = None,
-    config: ConfigFile = None,
-    set_: Set = None,
+    preset: PresetOption = None,
+    config: ConfigOption = None,
+    set_: SetOption = None,
 ) -> None:
     """Print what is wrong with a world (exit code 1), or measure it: how hard it is, laps, tour."""
-    worlds = import_role("services.robot_driver.simulated.world", "driver")
-    survey = import_role("services.robot_driver.atlas.survey", "driver")
+    worlds = import_installed("services.robot_driver.simulated.world", "sim")
+    survey = import_installed("services.robot_driver.atlas.survey", "sim")
     path = worlds.world_path(name)
     loaded = load(preset, config, set_, others={"robot.world": path.stem})
     problems = survey.problems_in(path, loaded)
@@ -82,11 +82,11 @@ def world_check(
 def world_switch(
     name: Annotated[str, typer.Argument(help="World to drive in, such as minus.")],
     start: Annotated[int, typer.Option(min=0, help="Which of its start poses.")] = 0,
-    at_episode: AtEpisode = 0,
-    run: Run = None,
-    run_dir: RunDir = None,
-    endpoint: Endpoint = None,
-    robot: Robot = None,
+    at_episode: AtEpisodeOption = 0,
+    run: RunOption = None,
+    run_dir: RunDirOption = None,
+    endpoint: EndpointOption = None,
+    robot: RobotOption = None,
 ) -> None:
     """Let robots of a running simulation go on in another world.
 
@@ -106,11 +106,11 @@ def obstacle_place(
     width: Annotated[float, typer.Option(help="m.")] = 0.5,
     height: Annotated[float, typer.Option(help="m.")] = 0.5,
     rgb: Annotated[tuple[int, int, int], typer.Option(help="Colour, 0..255 each.")] = (200, 60, 40),
-    at_episode: AtEpisode = 0,
-    run: Run = None,
-    run_dir: RunDir = None,
-    endpoint: Endpoint = None,
-    robot: Robot = None,
+    at_episode: AtEpisodeOption = 0,
+    run: RunOption = None,
+    run_dir: RunDirOption = None,
+    endpoint: EndpointOption = None,
+    robot: RobotOption = None,
 ) -> None:
     """Let a box stand in the world of a running simulation: solid, and seen."""
     box = {
@@ -130,11 +130,11 @@ def obstacle_place(
 @obstacle.command("remove")
 def obstacle_remove(
     name: Annotated[str, typer.Argument(help="Name of the box.")],
-    at_episode: AtEpisode = 0,
-    run: Run = None,
-    run_dir: RunDir = None,
-    endpoint: Endpoint = None,
-    robot: Robot = None,
+    at_episode: AtEpisodeOption = 0,
+    run: RunOption = None,
+    run_dir: RunDirOption = None,
+    endpoint: EndpointOption = None,
+    robot: RobotOption = None,
 ) -> None:
     """Take a box away again, one that was placed or one that belongs to the world."""
     change = {"kind": "remove", "name": name, "at_episode": at_episode}

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from services.processes import ACTOR, DRIVER, MAIN
 from shared.bus import Bus, Inbox
 from shared.config import Config
 from shared.errors import ConfigError, PeerMissing, RobotTaken
@@ -18,7 +19,6 @@ from shared.keys import ACTION, OBSERVATION, Peer
 from shared.messages import PROTOCOL_VERSION, Action, Motion, Observation
 from shared.service import TICK_S, Service, StopFlag, answer_signals, controlled, new_life
 
-ACTOR, DRIVER, EVERY_ROBOT = "actor", "driver", "main"
 LOOK_ROUND_S = 1.0
 """How often a commander looks whether it is still the only one."""
 FAREWELL_S = 0.6
@@ -128,9 +128,9 @@ def commanding(config: Config, robot: str | None) -> Iterator[Commander]:
         robot, fingerprint = _choose(config, peers, robot)
         life = new_life()
         refuse_others(peers, robot, life)
-        me = Service(ACTOR, robot, life, config, bus, stop)
+        me = Service(ACTOR.name, robot, life, config, bus, stop)
         # Whatever the robot is configured to do is right for who only answers it.
-        bus.announce(ACTOR, robot, life, PROTOCOL_VERSION, fingerprint)
+        bus.announce(ACTOR.name, robot, life, PROTOCOL_VERSION, fingerprint)
         with controlled(me):
             commander = Commander(me, robot)
             try:
@@ -142,8 +142,8 @@ def commanding(config: Config, robot: str | None) -> Iterator[Commander]:
 def refuse_others(peers: list[Peer], robot: str, life: str) -> None:
     """Raise RobotTaken if anybody but `life` answers this robot."""
     for peer in peers:
-        if peer.service == ACTOR and peer.id in (EVERY_ROBOT, robot) and peer.life != life:
-            hint = "corridor stop --service actor" if peer.id == EVERY_ROBOT else "Ctrl-C there"
+        if peer.service == ACTOR.name and peer.id in (MAIN, robot) and peer.life != life:
+            hint = "corridor stop --service actor" if peer.id == MAIN else "Ctrl-C there"
             raise RobotTaken(
                 f"robot {robot!r} is commanded by actor {peer.id!r} (life {peer.life}): "
                 f"end it first ({hint})"
@@ -152,7 +152,7 @@ def refuse_others(peers: list[Peer], robot: str, life: str) -> None:
 
 def _choose(config: Config, peers: list[Peer], robot: str | None) -> tuple[str, str]:
     """The robot that is meant, and the fingerprint of its configuration."""
-    drivers = {peer.id: peer for peer in peers if peer.service == DRIVER}
+    drivers = {peer.id: peer for peer in peers if peer.service == DRIVER.name}
     if robot is None:
         if not drivers:
             raise PeerMissing(

@@ -23,6 +23,7 @@ from services.launcher.live import View
 from services.launcher.supervisor import ChildSpec, Ending, Supervisor
 from services.monitor.heartbeats import Reader, Snapshot
 from services.monitor.running import locked
+from services.processes import COMMAND, ROUTER, SERVICES, Process
 from shared import settings
 from shared.bus import Bus
 from shared.config import BusConfig, Config
@@ -34,8 +35,6 @@ log = logging.getLogger(__name__)
 TICK_S = 0.25
 PORTS = range(10000, 30000)
 """Below what kernels hand out to outgoing connections: a restarted router finds its port free."""
-STAGES = {"driver": 0, "actor": 1, "replay": 2, "learner": 2, "router": 3}
-"""Order of stopping: the robot first, the router last."""
 
 
 def run_all(config: Config, folder: Path, *, listen: str | None, given: bool) -> int:
@@ -108,20 +107,20 @@ def supervise(config: Config, supervisor: Supervisor, stop: threading.Event) -> 
 
 
 def child_specs(config: Config, stored: Config, folder: Path, own: str | None) -> list[ChildSpec]:
-    """The processes of a run: our router if `own` tells where it listens, and the four services."""
-    corridor = (sys.executable, "-m", "services.cli")
+    """The processes of a run: our router if `own` tells where it listens, and all services."""
     specs = []
     if own is not None:
-        route = (*corridor, "router", "--listen", own, "--tethered")
-        specs.append(ChildSpec("router", route, STAGES["router"], may_finish=False))
+        specs.append(_spec(ROUTER, "--listen", own))
     # What may differ from the stored configuration, such as the endpoint, goes along.
     changes = settings.differences(stored, config)
     options = [f"--set={key}={settings.toml_value(value)}" for key, _, value in changes]
-    for name in ("replay", "learner", "actor", "driver"):
-        source = ("--config", str(folder / settings.FILE_NAME), "--run-dir", str(folder))
-        command = (*corridor, name, *source, *options, "--tethered")
-        specs.append(ChildSpec(name, command, STAGES[name]))
-    return specs
+    source = ("--config", str(folder / settings.FILE_NAME), "--run-dir", str(folder))
+    return [*specs, *(_spec(process, *source, *options) for process in SERVICES)]
+
+
+def _spec(process: Process, *options: str) -> ChildSpec:
+    command = (*COMMAND, process.name, *options, "--tethered")
+    return ChildSpec(process.name, command, process.stop_stage, process.may_finish)
 
 
 def free_endpoint() -> str:

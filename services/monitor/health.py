@@ -15,6 +15,7 @@ import time
 
 from services.monitor.heartbeats import Reader, Snapshot
 from services.monitor.words import learner_doing, replay_doing
+from services.processes import ACTOR, BY_NAME, ROUTER
 from shared import settings
 from shared.bus import Bus
 from shared.config import Config
@@ -22,7 +23,6 @@ from shared.errors import BadMessage, BusError, ConfigError
 from shared.keys import SERVICE
 from shared.messages import ServiceCommand, ServiceReply
 
-SERVICES = ("router", "driver", "actor", "replay", "learner")
 PERIODS = 3
 """Heartbeat periods after which silence counts as sick."""
 OBSERVING = {"waiting", "driving", "recovering"}
@@ -37,24 +37,24 @@ def check(name: str, config: Config) -> str:
     """What the service does now, in one line.
 
     Args:
-        name: one of `SERVICES`; the driver is that of `robot.id`.
+        name: a process of a run; the driver is that of `robot.id`.
         config: how to reach the run.
 
     Raises:
         Sick: it does not do its job.
     """
-    if name not in SERVICES:
-        raise Sick(f"expected one of {', '.join(SERVICES)}, got {name!r}")
+    if name not in BY_NAME:
+        raise Sick(f"expected one of {', '.join(BY_NAME)}, got {name!r}")
     try:
         with Bus(config.bus, config.run.name) as bus:
-            return "accepts sessions" if name == "router" else _doing(bus, name, config)
+            return "accepts sessions" if name == ROUTER.name else _doing(bus, name, config)
     except (BusError, BadMessage) as error:
         raise Sick(str(error)) from error
 
 
 def _doing(bus: Bus, name: str, config: Config) -> str:
     """Ping the service and wait for its heartbeat. Raises BusError when it does not answer."""
-    ident = config.robot.id if name == "driver" else "main"
+    ident = BY_NAME[name].ident(config.robot.id)
     inbox = bus.inbox()
     reader = Reader(inbox)
     bus.request(SERVICE, ServiceCommand(command="ping"), ServiceReply, ident=f"{name}-{ident}")
@@ -64,7 +64,7 @@ def _doing(bus: Bus, name: str, config: Config) -> str:
         reader.update()
         if told := _told(name, ident, reader.snapshot()):
             return told
-    if name == "actor" and not _needs_actor(reader.snapshot()):
+    if name == ACTOR.name and not _needs_actor(reader.snapshot()):
         return "waits for a robot"
     raise Sick(f"{name} {ident}: answers, but sent no heartbeat for {PERIODS} periods")
 

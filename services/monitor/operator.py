@@ -9,6 +9,7 @@ from typing import Any, Literal, TypeVar
 import typer
 from pydantic import ValidationError
 
+from services.processes import DRIVER, SERVICES
 from shared.bus import Bus
 from shared.codec import first_problem
 from shared.config import Config
@@ -26,16 +27,16 @@ from shared.messages import (
 )
 from shared.service import new_life
 
-Command = Literal["estop", "clear", "pause", "resume"]
+RobotOrder = Literal["estop", "clear", "pause", "resume"]
 M = TypeVar("M", bound=Message)
 
-DRIVER = "driver"
-STOP_ORDER = (DRIVER, "actor", "learner", "replay")
+STOP_ORDER = [process.name for process in reversed(SERVICES)]
+"""The robot first."""
 ATTEMPTS, ATTEMPT_S = 3, 1.0
 GONE_WITHIN_S = 10.0
 
 
-def command_robots(config: Config, command: Command, robot: str | None) -> int:
+def command_robots(config: Config, command: RobotOrder, robot: str | None) -> int:
     """Send a command to one robot or all of the run; print the state each acknowledges.
 
     Returns:
@@ -95,7 +96,7 @@ def _tell_robots(
     if robot is not None and not NAME.match(robot):
         raise ConfigError(f"--robot: expected a name like {NAME.pattern}, got {robot!r}")
     with Bus(config.bus, config.run.name) as bus:
-        present = [peer.id for peer in bus.peers() if peer.service == DRIVER]
+        present = [peer.id for peer in bus.peers() if peer.service == DRIVER.name]
         names = [robot] if robot is not None else present
         if not names:
             raise PeerMissing(

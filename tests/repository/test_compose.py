@@ -20,7 +20,9 @@ import zenoh
 from builders import LIFE, make_episode
 from fakes import fake_service, message
 
+from services import processes
 from services.monitor import health
+from services.processes import DRIVER, PROCESSES
 from services.replay.storage import Storage
 from shared import settings
 from shared.bus import Bus, zenoh_config
@@ -31,11 +33,11 @@ from tests.compose.trial import Failed, Trial
 
 ROOT = Path(__file__).parents[2]
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
-ROLES = ("driver", "actor", "replay", "learner")
-DRIVERS = {"sim": "driver-sim", "robotino": "driver-robotino", "ros2": "driver-ros2"}
+ROLES = [process.name for process in processes.SERVICES]
+DRIVERS = dict(zip(DRIVER.extras, DRIVER.images, strict=True))
 """Service and image of each profile."""
-SERVICES = (*DRIVERS.values(), "actor", "replay", "learner")
-IMAGES = ("router", *SERVICES)
+SERVICES = [image for process in processes.SERVICES for image in process.images]
+IMAGES = ["router", *SERVICES]
 FOREIGN = {
     "pybullet": "pybullet",
     "opencv-python-headless": "cv2",
@@ -116,7 +118,7 @@ def distributions(names: set[str]) -> set[str]:
 
 def role(name: str) -> str:
     """The service that an image or a service of the compose file runs."""
-    return "driver" if name.startswith("driver-") else name
+    return next(process.name for process in PROCESSES if name in process.images)
 
 
 def test_every_service_has_an_image_of_its_own_run_by_nobody_special() -> None:
@@ -127,6 +129,14 @@ def test_every_service_has_an_image_of_its_own_run_by_nobody_special() -> None:
         assert 'ENTRYPOINT ["corridor"]' in text
         assert f'CMD ["{role(name)}"' in text
     assert stages()["base"][0] == "${BASE_IMAGE}"
+
+
+def test_there_is_one_image_for_each_process_with_what_it_needs() -> None:
+    ours = {name for name, (_, text) in stages().items() if "HEALTHCHECK" in text}
+    assert ours == set(IMAGES)
+    for process in PROCESSES:
+        for number, image in enumerate(process.images):
+            assert set(process.extras[number : number + 1]) <= extras(image)
 
 
 def test_images_are_small_where_they_can_be() -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from services.cli import main as cli
+from services.cli.options import import_installed
 from services.launcher.up import PORTS, child_specs, free_endpoint, reachable, run_all
 from services.monitor.running import is_up, locked, reach
 from shared import settings
@@ -150,9 +151,9 @@ def test_a_missing_library_is_named_with_what_to_install(
     with pytest.raises(
         ConfigError, match=r"actor: needs .* torch.* pip install 'corridor\[actor\]'"
     ):
-        cli.import_role("shared.rl.network", "actor")
+        import_installed("shared.rl.network", "actor")
     with pytest.raises(ModuleNotFoundError):
-        cli.import_role("services.actor.nothing", "actor")
+        import_installed("services.actor.nothing", "actor")
 
 
 def test_the_command_line_is_light() -> None:

@@ -1,0 +1,92 @@
+"""The commands about experiments and what runs leave behind: run, report, evaluate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from services.cli.options import ConfigOption, SetOption, import_installed, load
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the commands."""
+    for command in (experiment, report, evaluate):
+        app.command()(command)
+
+
+def experiment(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[NAME]...", help="Plans, such as plus-rmm; none: list them."),
+    ] = None,
+    scale: Annotated[
+        str, typer.Option(help="full: the thesis's constants; mini: minutes instead of days.")
+    ] = "mini",
+    seeds: Annotated[
+        int, typer.Option(min=1, help="How many of the plan's seeds, from the first.")
+    ] = 1,
+    seed: Annotated[int | None, typer.Option(help="This seed alone.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, max=64, help="Runs side by side.")] = 1,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of all runs; default runs/experiments.")
+    ] = None,
+) -> None:
+    """Run experiments in this process, without a router; run again, they go on.
+
+    A plan that begins with the end of another runs that one first.
+    """
+    commands = import_installed("experiments.runs.commands", "experiments")
+    if not names:
+        typer.echo(commands.listing())
+        return
+    raise typer.Exit(commands.run(names, scale, seeds, seed, jobs, out))
+
+
+def report(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUNS...", help="Folders of seeds, of experiments, or of several experiments."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the pages.")] = Path("report"),
+    gpu_step_ms: Annotated[
+        float | None,
+        typer.Option(help="Measured time of a GPU's gradient step; adds projected hours.", min=0),
+    ] = None,
+) -> None:
+    """Write figures, tables and findings of finished runs as HTML and Markdown."""
+    full_report = import_installed("experiments.report.full_report", "experiments")
+    pages = full_report.write_report(runs, out, gpu_step_ms)
+    typer.echo(f"written: {pages[0]} and {len(pages) - 1} Markdown pages beside it")
+
+
+def evaluate(
+    run: Annotated[
+        Path,
+        typer.Argument(metavar="RUN", help="Folder of a run, or a .safetensors file of weights."),
+    ],
+    world: Annotated[
+        str | None, typer.Option(help="Where to drive; default: the run's world.")
+    ] = None,
+    starts: Annotated[int, typer.Option(help="Number of drives.", min=1, max=1000)] = 16,
+    actions: Annotated[int, typer.Option(help="Of each drive.", min=1, max=100_000)] = 400,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the results; default: evaluation-WORLD.")
+    ] = None,
+    config: ConfigOption = None,
+    set_: SetOption = None,
+) -> None:
+    """Drive with a run's network, frozen, beside random actions and the planner.
+
+    The run's own config.toml tells robot and network; --config and --set stand in for a missing one
+    or change it.
+    """
+    command = import_installed("experiments.drives.evaluate", "experiments")
+    file = config or import_installed("services.commander.frozen", "actor").configuration_of(run)
+    loaded = load(None, file, set_, others={"robot.world": world})
+    folder = out or Path(f"evaluation-{loaded.robot.world}")
+    command.run(run, loaded, starts, actions, folder)
+    typer.echo(f"written to {folder}")

@@ -1,0 +1,135 @@
+"""The commands about a whole run: start it, look at it, stop it, halt and release its robots."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from services.cli.options import (
+    CHOOSE,
+    ConfigOption,
+    EndpointOption,
+    PresetOption,
+    RobotOption,
+    RunDirOption,
+    RunOption,
+    SeedOption,
+    SetOption,
+    default_folder,
+    load,
+    reach,
+)
+
+if TYPE_CHECKING:
+    from services.monitor.operator import RobotOrder
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the commands."""
+    for command in (up, status, stop):
+        app.command()(command)
+    _add_order(app, "estop", "Stop robots at once; they stay stopped until `corridor clear`.")
+    _add_order(app, "clear", "Release the emergency stop of robots.")
+    _add_order(app, "pause", "Let robots wait after the current action, until `corridor resume`.")
+    _add_order(app, "resume", "Let paused robots drive on.")
+    app.command("config")(show_config)
+
+
+def up(
+    preset: PresetOption = None,
+    config: ConfigOption = None,
+    set_: SetOption = None,
+    run: RunOption = None,
+    seed: SeedOption = None,
+    run_dir: RunDirOption = None,
+    endpoint: Annotated[
+        str | None,
+        typer.Option(
+            help="Use the router at this endpoint instead of starting one.",
+            rich_help_panel=CHOOSE,
+        ),
+    ] = None,
+    listen: Annotated[
+        str | None,
+        typer.Option(
+            help="Where the own router listens; default: loopback, a free port.",
+            rich_help_panel=CHOOSE,
+        ),
+    ] = None,
+    episodes: Annotated[
+        int | None,
+        typer.Option(help="End by itself after so many episodes (run.episodes); 0: never."),
+    ] = None,
+) -> None:
+    """Start router, replay, learner, actor and driver, and show how the robot learns.
+
+    Ctrl-C stops everything within five seconds; the same command continues the run. All that a
+    run produces lies in its folder.
+    """
+    loaded = load(preset, config, set_, run, seed, endpoint, {"run.episodes": episodes})
+    from services.launcher.up import run_all
+
+    code = run_all(
+        loaded, run_dir or default_folder(loaded), listen=listen, given=endpoint is not None
+    )
+    raise typer.Exit(code)
+
+
+def status(
+    run: RunOption = None,
+    run_dir: RunDirOption = None,
+    endpoint: EndpointOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    require: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SERVICE",
+            help="Exit with 1 unless this service answers; repeatable (for health checks).",
+        ),
+    ] = None,
+) -> None:
+    """List the services of a run that are alive, with versions, rates and memory."""
+    from services.monitor.status import show
+
+    raise typer.Exit(show(reach(run, run_dir, endpoint), as_json=as_json, require=require or []))
+
+
+def stop(
+    run: RunOption = None,
+    run_dir: RunDirOption = None,
+    endpoint: EndpointOption = None,
+    service: Annotated[
+        list[str] | None,
+        typer.Option(metavar="SERVICE", help="Only this service (driver, actor, ...); repeatable."),
+    ] = None,
+) -> None:
+    """Ask the services of a run to stop cleanly; `corridor up` ends with them."""
+    from services.monitor.operator import stop_services
+
+    raise typer.Exit(stop_services(reach(run, run_dir, endpoint), service or []))
+
+
+def _add_order(app: typer.Typer, name: RobotOrder, text: str) -> None:
+    """Add a command that robots acknowledge."""
+
+    def command(
+        run: RunOption = None,
+        run_dir: RunDirOption = None,
+        endpoint: EndpointOption = None,
+        robot: RobotOption = None,
+    ) -> None:
+        from services.monitor.operator import command_robots
+
+        raise typer.Exit(command_robots(reach(run, run_dir, endpoint), name, robot))
+
+    app.command(name, help=text)(command)
+
+
+def show_config(
+    preset: PresetOption = None, config: ConfigOption = None, set_: SetOption = None
+) -> None:
+    """Print the resolved configuration as TOML, every key with its value."""
+    from shared.settings import to_toml
+
+    typer.echo(to_toml(load(preset, config, set_)), nl=False)

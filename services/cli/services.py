@@ -1,0 +1,92 @@
+"""The commands that run one process of a run: each service, and the router."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from services.cli.options import (
+    ConfigOption,
+    EndpointOption,
+    PresetOption,
+    RunDirOption,
+    RunOption,
+    SeedOption,
+    SetOption,
+    TetheredOption,
+    default_folder,
+    import_installed,
+    load,
+)
+from services.launcher.tether import tether
+from services.processes import ROUTER, SERVICES, Process
+
+if TYPE_CHECKING:
+    from shared.config import Config
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the commands."""
+    for process in SERVICES:
+        _add_service(app, process)
+    app.command(ROUTER.name, help=ROUTER.purpose)(router)
+
+
+def _add_service(app: typer.Typer, process: Process) -> None:
+    """Add the command that runs one service in this process."""
+
+    def command(
+        preset: PresetOption = None,
+        config: ConfigOption = None,
+        set_: SetOption = None,
+        seed: SeedOption = None,
+        run: RunOption = None,
+        run_dir: RunDirOption = None,
+        endpoint: EndpointOption = None,
+        tethered: TetheredOption = False,
+    ) -> None:
+        if tethered:
+            tether()
+        loaded = load(preset, config, set_, run, seed, endpoint)
+        raise typer.Exit(serve(process, loaded, run_dir or default_folder(loaded)))
+
+    app.command(process.name, help=process.purpose)(command)
+
+
+def serve(process: Process, config: Config, folder: Path) -> int:
+    """Run one service until it stops; returns its exit code."""
+    from shared.service import guarded, setup_logging, starting
+    from shared.settings import claim
+
+    claim(folder, config)
+    setup_logging(process.name, folder)
+
+    def run() -> None:
+        with starting():
+            import_installed(process.module, process.extras[0]).run(config, folder)
+
+    return guarded(process.name, run)
+
+
+def router(
+    preset: PresetOption = None,
+    config: ConfigOption = None,
+    set_: SetOption = None,
+    listen: Annotated[
+        str | None,
+        typer.Option(
+            help="Where to listen; default bus.endpoint, which is loopback only. Port 0 takes a "
+            "free port. Example for all interfaces: tcp/0.0.0.0:7447."
+        ),
+    ] = None,
+    tethered: TetheredOption = False,
+) -> None:
+    """Route between the services of runs until stopped."""
+    loaded = load(preset, config, set_, endpoint=listen)
+    if tethered:
+        tether()
+    from services.router.service import run as route
+
+    route(loaded.bus.endpoint, typer.echo)
