@@ -31,7 +31,7 @@ SILENT_S = 10.0
 
 
 @dataclass(frozen=True)
-class Choice:
+class FrozenChoice:
     """What the network wants for one image."""
 
     action: int
@@ -44,7 +44,7 @@ class Choice:
         return f"{what:13} predicted " + " ".join(f"{value:+.2f}" for value in self.values)
 
 
-class Mind:
+class FrozenPolicy:
     """The frozen network and the turn it is in, if any.
 
     Args:
@@ -58,16 +58,16 @@ class Mind:
         self._turns = SpotTurns(config.robot.turn_rad_s * config.robot.period_s)
         self._draw = generator(config.run.seed, ROLE, robot)
 
-    def choose(self, observation: Observation) -> Choice:
+    def choose(self, observation: Observation) -> FrozenChoice:
         """What to do about an observation."""
         values = self._network.all_values(image_array(observation.image)[np.newaxis])[0]
         action = choose_greedily(values, self._draw)
         side = self._turns.decide(values, action)
-        return Choice(action, side, tuple(map(float, values)))
+        return FrozenChoice(action, side, tuple(map(float, values)))
 
 
 @dataclass
-class Log:
+class DriveTally:
     """What the robot did so far, from its observations and what was asked of it."""
 
     actions: int = 0
@@ -133,20 +133,24 @@ def run(
     predictor = found.predictor(network)
     with commanding(config, robot) as commander:
         echo(f"{commander.robot}: driven by {found.path}; Ctrl-C stops it")
-        mind, log = Mind(predictor, config, commander.robot), Log()
+        policy, tally = FrozenPolicy(predictor, config, commander.robot), DriveTally()
         try:
-            _drive(commander, mind, log, actions, echo)
+            _drive(commander, policy, tally, actions, echo)
         finally:
-            echo(f"{commander.robot}: {log}")
+            echo(f"{commander.robot}: {tally}")
     return 0
 
 
 def _drive(
-    commander: Commander, mind: Mind, log: Log, actions: int, echo: Callable[[str], None]
+    commander: Commander,
+    policy: FrozenPolicy,
+    tally: DriveTally,
+    actions: int,
+    echo: Callable[[str], None],
 ) -> None:
     now_s = time.monotonic()
     tell_s, silent_s = now_s, now_s + SILENT_S
-    while not commander.stop.is_set() and not (actions and log.actions >= actions):
+    while not commander.stop.is_set() and not (actions and tally.actions >= actions):
         observation = commander.observe(TICK_S)
         now_s = time.monotonic()
         if observation is None:
@@ -155,16 +159,16 @@ def _drive(
                 echo(f"{commander.robot}: nothing heard for {SILENT_S:.0f} s (stopped, paused?)")
             continue
         silent_s = now_s + SILENT_S
-        log.see(observation)
-        if actions and log.actions >= actions:
+        tally.see(observation)
+        if actions and tally.actions >= actions:
             return
-        choice = mind.choose(observation)
+        choice = policy.choose(observation)
         if choice.side:
             turn: Motion = "turn-left" if choice.side == "left" else "turn-right"
             commander.answer(observation, motion=turn, values=choice.values)
         else:
             commander.answer(observation, action=choice.action, values=choice.values)
-        log.ask()
+        tally.ask()
         if now_s >= tell_s:
             tell_s = now_s + TELL_EVERY_S
-            echo(f"{choice}  {log}")
+            echo(f"{choice}  {tally}")

@@ -10,7 +10,7 @@ from shared.messages import Motion
 
 DEADMAN_S = 0.3
 """Without another press of a key for so long the robot stops. Keyboards repeat faster."""
-Command = Literal["", "estop", "quit"]
+KeyCommand = Literal["", "estop", "quit"]
 MOTIONS: dict[str, Motion] = {
     "w": "forward",
     "s": "back",
@@ -67,7 +67,7 @@ class Wish:
     A motion is wanted for `DEADMAN_S` after its key; any other key ends it at once.
     """
 
-    command: Command = ""
+    command: KeyCommand = ""
     """Last asked for; taken by `take_command`."""
     _motion: Motion = ""
     _until_s: float = -math.inf
@@ -88,7 +88,7 @@ class Wish:
             self._motion = ""
         return self._motion
 
-    def take_command(self) -> Command:
+    def take_command(self) -> KeyCommand:
         """What was asked for since the last call. An emergency stop goes before everything."""
         command, self.command = self.command, ""
         return command

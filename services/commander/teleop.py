@@ -25,7 +25,7 @@ from shared.messages import Motion, Observation, RobotCommand, RobotState
 POLL_S = 0.02
 """How often keys and observations are looked at."""
 PACE = 0.9
-"""Of a period: in lockstep, where time waits for answers, they come no faster than this."""
+"""Least time between two answers, in periods: in lockstep, time itself waits for answers."""
 ESTOP_ATTEMPTS, ESTOP_S = 3, 1.0
 READ_BYTES = 256
 HELP = (
@@ -81,7 +81,7 @@ class Teleop:
         self._shown = ""
 
     def run(self) -> None:
-        """Until the person quits, the terminal closes, or a signal comes."""
+        """Answer keys until the person quits, the terminal closes, or a signal comes."""
         while not self._commander.stop.is_set():
             if not self._read():
                 return

@@ -10,7 +10,7 @@ from typing import Protocol, TextIO
 from rich.console import Console
 from rich.live import Live
 
-from services.launcher.live import View, line, panel, warnings
+from services.launcher.live import RunView, line, panel, warnings
 
 LINE_EVERY_S = 5.0
 """Period of the plain lines; a change of the warnings shows at once."""
@@ -19,7 +19,7 @@ LINE_EVERY_S = 5.0
 class Display(Protocol):
     """Shows views."""
 
-    def show(self, view: View) -> None:
+    def show(self, view: RunView) -> None:
         """Show the newest view."""
 
 
@@ -29,7 +29,7 @@ class Table:
     def __init__(self, live: Live) -> None:
         self._live = live
 
-    def show(self, view: View) -> None:
+    def show(self, view: RunView) -> None:
         """Redraw the table."""
         self._live.update(panel(view), refresh=True)
 
@@ -42,7 +42,7 @@ class Lines:
         self._next_s = 0.0
         self._shown: tuple[int, str] = (0, "")
 
-    def show(self, view: View) -> None:
+    def show(self, view: RunView) -> None:
         """Write a line if it is time, or if something else is wrong than before."""
         state = (len(warnings(view)), view.note)
         if self._clock() < self._next_s and state == self._shown:

@@ -31,7 +31,7 @@ RECENT_S = 60.0
 
 
 @dataclass(frozen=True)
-class View:
+class RunView:
     """Everything the display shows."""
 
     run: str
@@ -49,19 +49,19 @@ class View:
 # ---------------------------------------------------------------- words
 
 
-def episodes(view: View) -> str:
+def episodes(view: RunView) -> str:
     """Episodes stored, and how many are wanted."""
     replay = view.snapshot.replay
     count = str(replay.message.episode) if replay else "-"
     return f"{count} of {view.episodes_wanted}" if view.episodes_wanted else count
 
 
-def warnings(view: View) -> list[str]:
+def warnings(view: RunView) -> list[str]:
     """What is not as it should be, most urgent first."""
     return [*_robot_warnings(view), *_child_warnings(view), *_silences(view), *_losses(view)]
 
 
-def _robot_warnings(view: View) -> Iterator[str]:
+def _robot_warnings(view: RunView) -> Iterator[str]:
     for name, seen in view.snapshot.robots.items():
         if seen.message.state == "estop":
             yield f"robot {name}: emergency stop, release it by `corridor clear`"
@@ -71,7 +71,7 @@ def _robot_warnings(view: View) -> Iterator[str]:
             yield f"robot {name}: stands still: {seen.message.reason}"
 
 
-def _child_warnings(view: View) -> Iterator[str]:
+def _child_warnings(view: RunView) -> Iterator[str]:
     for child in view.children:
         if child.state == "restarting":
             yield f"{child.name} is being restarted after {child.note}"
@@ -83,7 +83,7 @@ def _child_warnings(view: View) -> Iterator[str]:
             yield f"{child.name} was restarted {times}{why}"
 
 
-def _silences(view: View) -> Iterator[str]:
+def _silences(view: RunView) -> Iterator[str]:
     snapshot = view.snapshot
     heartbeats: dict[str, Seen[Message] | None] = {
         "replay": snapshot.replay,
@@ -96,7 +96,7 @@ def _silences(view: View) -> Iterator[str]:
             yield f"{name}: silent for {seen.age_s:.0f} s"
 
 
-def _losses(view: View) -> Iterator[str]:
+def _losses(view: RunView) -> Iterator[str]:
     snapshot = view.snapshot
     undecodable = sum(
         seen.message.undecodable
@@ -116,7 +116,7 @@ def _losses(view: View) -> Iterator[str]:
 # ---------------------------------------------------------------- one line
 
 
-def line(view: View) -> str:
+def line(view: RunView) -> str:
     """Everything in one line, for logs and pipes."""
     snapshot = view.snapshot
     parts = [duration(view.uptime_s)]
@@ -146,7 +146,7 @@ def line(view: View) -> str:
 # ---------------------------------------------------------------- live table
 
 
-def panel(view: View) -> RenderableType:
+def panel(view: RunView) -> RenderableType:
     """The whole live view."""
     table = Table.grid(padding=(0, 2))
     table.add_column(style="bold", no_wrap=True)
@@ -160,7 +160,7 @@ def panel(view: View) -> RenderableType:
     return Panel(Group(table, *problems), title=title, subtitle=foot, title_align="left")
 
 
-def _rows(view: View) -> Iterator[tuple[RenderableType, ...]]:
+def _rows(view: RunView) -> Iterator[tuple[RenderableType, ...]]:
     snapshot = view.snapshot
     if snapshot.replay is None and snapshot.learner is None:
         yield "starting", ", ".join(child.name for child in view.children), ""
@@ -174,7 +174,7 @@ def _rows(view: View) -> Iterator[tuple[RenderableType, ...]]:
         yield _robot_row(name, robot.message if robot else None, actor.message if actor else None)
 
 
-def _learning_rows(view: View, replay: ReplayState) -> Iterator[tuple[RenderableType, ...]]:
+def _learning_rows(view: RunView, replay: ReplayState) -> Iterator[tuple[RenderableType, ...]]:
     yield "episodes", episodes(view), f"fitness {fitness(replay)} (mean of the last 100)"
     laps = f"laps {replay.laps_left} left, {replay.laps_right} right"
     yield "bumps", str(replay.bumps), laps

@@ -19,7 +19,7 @@ from typing import Self
 from rich.console import Console
 
 from services.launcher.display import display_for
-from services.launcher.live import View
+from services.launcher.live import RunView
 from services.launcher.supervisor import ChildSpec, Ending, Supervisor
 from services.monitor.heartbeats import Reader, Snapshot
 from services.monitor.running import locked
@@ -89,7 +89,7 @@ def supervise(config: Config, supervisor: Supervisor, stop: threading.Event) -> 
                 ending = Ending(0, f"{wanted} episodes are done")
             if ending is None and stop.is_set():
                 ending = Ending(0, "all stopped")
-            view = View(
+            view = RunView(
                 config.run.name,
                 config.bus.endpoint,
                 time.monotonic() - start_s,

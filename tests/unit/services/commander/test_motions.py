@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from services.commander.commander import refuse_others
-from services.commander.drive import Log
+from services.commander.drive import DriveTally
 from services.robot_driver.driver import Driver, motion_velocity
 from services.robot_driver.robot import STANDSTILL, Felt, Velocity
 from services.robot_driver.simulated.sim import SimRobot
@@ -198,7 +198,7 @@ def test_there_is_one_commander_at_a_time(service: str, ident: str, life: str, t
 
 
 def test_the_log_of_a_drive_counts_actions_turns_bumps_and_metres() -> None:
-    log = Log()
+    log = DriveTally()
 
     def see(sequence: int, ask: bool = True, **fields: object) -> None:
         log.see(make_observation(sequence, **fields))

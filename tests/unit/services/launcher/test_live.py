@@ -11,7 +11,7 @@ from fakes import message
 from rich.console import Console
 
 from services.launcher.display import LINE_EVERY_S, Lines, Table, display_for
-from services.launcher.live import View, duration, line, panel, warnings
+from services.launcher.live import RunView, duration, line, panel, warnings
 from services.launcher.supervisor import ChildStatus
 from services.monitor.heartbeats import Reader, Seen, Snapshot
 from shared.keys import ACTOR_STATE, REPLAY_STATE, Stream
@@ -30,13 +30,13 @@ ACTOR = message(ActorState, robot="r1", phase="driving", step=17, actions_per_s=
 ROBOT = message(RobotState, robot="r1", state="driving", world="minus")
 
 
-def view(**given: Any) -> View:
+def view(**given: Any) -> RunView:
     fields: dict[str, Any] = {"run": "demo", "endpoint": "tcp/127.0.0.1:1", "uptime_s": 3725.0}
     snapshot = {name: given.pop(name) for name in Snapshot.__annotations__ if name in given}
-    return View(**{**fields, **given}, snapshot=Snapshot(**snapshot))
+    return RunView(**{**fields, **given}, snapshot=Snapshot(**snapshot))
 
 
-def full(**given: Any) -> View:
+def full(**given: Any) -> RunView:
     seen = {
         "replay": Seen(REPLAY, 0.1),
         "learner": Seen(LEARNER, 0.1),
@@ -46,7 +46,7 @@ def full(**given: Any) -> View:
     return view(**{**seen, **given})
 
 
-def text(view: View, width: int = 110) -> str:
+def text(view: RunView, width: int = 110) -> str:
     console = Console(file=io.StringIO(), width=width, force_terminal=False)
     with console.capture() as capture:
         console.print(panel(view))
@@ -200,7 +200,7 @@ def test_the_reader_keeps_the_newest_and_its_age() -> None:
     assert snapshot.actions_per_s == pytest.approx(22.34)
 
 
-def shown_lines(views: Sequence[tuple[float, View]]) -> list[str]:
+def shown_lines(views: Sequence[tuple[float, RunView]]) -> list[str]:
     """Output of the plain display for views shown at given times."""
     now_s = 0.0
     output = io.StringIO()
