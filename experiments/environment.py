@@ -36,10 +36,10 @@ Info = dict[str, Any]
 class CorridorEnv(gymnasium.Env[Image, np.int64]):
     """One simulated robot behind its driver.
 
-    Observation: the grey image, uint8 [50, 75, 1]. Action: 0 forward, 1 forward/left, 2
-    forward/right (A21). Reward: the part of the longest possible way that the robot got on, -1 at a
-    bump. A bump ends an episode; how many actions end one without a bump is for a wrapper to say,
-    and the registered environments have one.
+    Observation: the grey image, uint8 [50, 75, 1]. Action: its number in the table of
+    actions (A21). Reward: the part of the longest possible way that the robot got on, -1 at a bump.
+    A bump ends an episode; how many actions end one without a bump is for a wrapper to say, and the
+    registered environments have one.
 
     The next episode begins where the last one ended (A8), after the driver has recovered from the
     bump (E11). With a seed it begins at the first start pose instead, with recoveries drawn anew

@@ -23,6 +23,8 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from shared.facts import SHORT_NAMES
+
 Value = int | float | str
 Row = Mapping[str, Value]
 
@@ -48,9 +50,7 @@ EPISODE_COLUMNS = (
     "target_age",  # episodes since the target network was copied
     "memory",
     "capacity",
-    "forward",  # samples in the memory by action
-    "left",
-    "right",
+    *SHORT_NAMES,  # samples in the memory by action
     "by_world",  # samples in the memory by corridor: "plus=2000 minus=1333"
     "discarded",
     "last_resort",  # of those, by age because candidates ran out (E21)

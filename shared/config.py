@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from shared.facts import NAME
+from shared.facts import IMAGE_HEIGHT, IMAGE_WIDTH, NAME
 from shared.rl.retention.table import STRATEGIES
 
 if TYPE_CHECKING:
@@ -75,9 +75,9 @@ class CameraConfig(Section):
     forward_m: float = Field(default=0.11, ge=0.0, lt=0.5)
     vertical_fov_deg: float = Field(default=45.0, gt=5.0, lt=120.0)
     aspect: float = Field(default=16.0 / 9.0, gt=0.5, lt=4.0)
-    """Of the projection; the 16:9 picture is squeezed into 75x50 (E29)."""
-    render_width_px: int = Field(default=75, ge=75, le=1920)
-    render_height_px: int = Field(default=50, ge=50, le=1080)
+    """Aspect ratio of the projection, whose picture is squeezed into the network's image (E29)."""
+    render_width_px: int = Field(default=IMAGE_WIDTH, ge=IMAGE_WIDTH, le=1920)
+    render_height_px: int = Field(default=IMAGE_HEIGHT, ge=IMAGE_HEIGHT, le=1080)
 
 
 class HardwareConfig(Section):
@@ -161,7 +161,7 @@ class RobotConfig(Section):
     speed_m_s: float = Field(default=0.6, gt=0.0, le=2.0)
     """Forward speed of all three actions (A21, E31)."""
     turn_rad_s: float = Field(default=math.radians(80.0), gt=0.0, le=3.0)
-    """Turn rate of forward/left and forward/right (A21, E31)."""
+    """Turn rate of the actions that turn (A21, E31)."""
     max_speed_m_s: float = Field(default=0.8, gt=0.0, le=2.0)
     """Clamp: commands are cut to it."""
     max_turn_rad_s: float = Field(default=1.5, gt=0.0, le=3.0)

@@ -105,7 +105,7 @@ class Action(Message):
     attempt: Count = 0
     """Of the observation answered."""
     action: Annotated[int, Field(ge=0, lt=ACTION_COUNT)] | None
-    """0 forward, 1 forward/left, 2 forward/right (A21); None: hold still for one period."""
+    """Number of the action in the table of actions (A21); None: hold still for one period."""
     motion: Motion = ""
     """Instead of an action, which is None then: move like this for one period. A driver that cannot
     holds still. It counts as no action: `sequence` stays, and the next observation says "moved"."""

@@ -266,13 +266,7 @@ def _read_preset(preset: str) -> tuple[Tree, str]:
         return _read_toml(Path(preset), "preset file"), f"preset file {preset}"
     if preset not in preset_names():
         known = ", ".join(preset_names())
-        plans = resources.files("experiments").joinpath("plans")
-        hint = ""
-        if plans.joinpath(f"{preset}.toml").is_file():
-            hint = f"; {preset} is an experiment: corridor experiment {preset}"
-        raise ConfigError(
-            f"--preset: expected one of {known} or a .toml file, got {preset!r}{hint}"
-        )
+        raise ConfigError(f"--preset: expected one of {known} or a .toml file, got {preset!r}")
     text = resources.files("shared").joinpath("presets", f"{preset}.toml").read_bytes()
     return _parse(text, f"preset {preset}"), f"preset {preset}"
 

@@ -27,6 +27,7 @@ from experiments.records import (
     read_csv,
 )
 from shared.errors import ConfigError, StateError
+from shared.facts import ACTION_COUNT, IMAGE_SHAPE
 
 Floats = npt.NDArray[np.float64]
 
@@ -34,7 +35,6 @@ LEAST_WINDOW = 10
 """Episodes that a point of a curve averages at the smallest scale."""
 WINDOW = 100
 """The same at full scale (A37)."""
-IMAGE = (50, 75)
 
 
 class _Record(BaseModel):
@@ -135,7 +135,7 @@ class Probes:
     images: npt.NDArray[np.uint8]
     """uint8 [n, 50, 75]."""
     values: Floats
-    """float64 [n, 3]: clipped rewards of forward, forward/left, forward/right."""
+    """float64 [n, actions]: clipped rewards of all actions."""
 
 
 @dataclass(frozen=True)
@@ -345,9 +345,9 @@ def _probes(path: Path) -> Probes:
         world = str(arrays["world"])
     except KeyError as error:
         raise StateError(f"{path}: expected an array {error}, found none") from error
-    if images.shape[1:] != IMAGE or images.dtype != np.uint8:
+    if images.shape[1:] != IMAGE_SHAPE or images.dtype != np.uint8:
         raise StateError(f"{path}: expected images uint8 [n, 50, 75], got {images.shape}")
-    if values.shape != (len(images), 3):
+    if values.shape != (len(images), ACTION_COUNT):
         raise StateError(f"{path}: expected values [{len(images)}, 3], got {values.shape}")
     label = path.stem.removeprefix("probes-")
     return Probes(label, world, images, values.astype(np.float64))

@@ -29,7 +29,7 @@ class Probes:
     images: npt.NDArray[np.uint8]
     """[n, 50, 75]."""
     values: npt.NDArray[np.float32]
-    """[n, 3]: clipped predictions for forward, forward/left, forward/right."""
+    """[n, actions]: clipped predictions for all actions."""
     poses: npt.NDArray[np.float64]
     """[n, 3]: x, y, heading."""
 

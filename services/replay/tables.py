@@ -5,7 +5,7 @@ Images are written once and never changed; what changes lies beside them. Tables
 meta      counters, change number, processed commit, capacity, what retention keeps, run
 commits   commit number -> record of the submission (provenance, metrics)
 identity  robot, life, number -> commit number: the deduplication
-images    insertion number -> 3750 bytes
+images    insertion number -> bytes of the image
 samples   insertion number -> row (reward as inserted)
 dead      insertion number -> change number of its discard; kept until the feed forgets the change
 columns   "rewards": all rewards after the newest equalisation; "marks": those of retention

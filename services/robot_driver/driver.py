@@ -36,7 +36,7 @@ SLICE_S = 0.02
 
 
 def action_velocity(config: Config, action: int) -> Velocity:
-    """Body velocity of an action (A21): forward, turning for forward/left and forward/right."""
+    """Body velocity of an action (A21): forward, and turning where the action turns."""
     turn_rad_s = ACTIONS[action].turn * config.robot.turn_rad_s
     return Velocity(config.robot.speed_m_s, 0.0, turn_rad_s)
 

@@ -12,17 +12,25 @@ from safetensors.torch import save as save_safetensors
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (the customary name)
 
-from shared.facts import ACTION_BITS, ACTIONS
+from shared.facts import ACTION_BITS, ACTIONS, IMAGE_SHAPE
 from shared.rl.draws import generator
 
 if TYPE_CHECKING:
     from shared.config import NetworkConfig
 
-MAP_HEIGHT, MAP_WIDTH = 9, 15
-"""MaxPool2 maps: valid padding, stride 1, floor pooling (E16)."""
 POOLED = {"ccpccp": (False, True, False, True), "cpcccp": (True, False, False, True)}
 """Which of the four convolutions a pool follows, by layout (E16)."""
 MAX_WEIGHT_BYTES = 64 * 1024 * 1024
+
+
+def _map_size(size: int) -> int:
+    """Height or width of the last maps of an image: valid padding, stride 1, floor pooling (E16)."""
+    for pooled in POOLED["ccpccp"]:  # the other layout comes to the same
+        size = (size - 2) // (2 if pooled else 1)
+    return size
+
+
+MAP_HEIGHT, MAP_WIDTH = map(_map_size, IMAGE_SHAPE)
 
 
 class QNetwork(nn.Module):

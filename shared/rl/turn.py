@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from shared.facts import IMAGE_SHAPE
 from shared.rl.engine import Progress
 from shared.rl.equalisation import due, equalised
 from shared.rl.memory import SAMPLE, Images, ReplayMemory
@@ -52,7 +53,7 @@ def sample_rows(
     rows["world"] = worlds[np.frombuffer(episode.sample_worlds, np.uint8)]
     places = np.frombuffer(episode.positions, "<f4").reshape(n, 3)
     rows["x_m"], rows["y_m"], rows["heading_rad"] = places.T
-    return rows, np.frombuffer(episode.images, np.uint8).reshape(n, 50, 75)
+    return rows, np.frombuffer(episode.images, np.uint8).reshape(n, *IMAGE_SHAPE)
 
 
 def maintain(

@@ -19,14 +19,15 @@ import numpy.typing as npt
 
 from services.robot_driver.simulated.world import World
 from shared.config import RobotConfig
+from shared.facts import ACTION_COUNT, ACTIONS
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Table = npt.NDArray[np.float32]
 """float32 [headings, rows, columns]: rows run along y, columns along x, from the lower corner."""
 
-TURNS = (0.0, 1.0, -1.0)
-"""Turn of the three actions in units of the turn rate: forward, forward/left, forward/right."""
+TURNS = tuple(float(action.turn) for action in ACTIONS)
+"""Turn of every action in units of the turn rate."""
 CONTACT_M = 0.001
 """Gap to a wall that counts as contact, as in the simulation."""
 _EXACT_STEP_M = 0.01
@@ -62,7 +63,7 @@ class Motion:
 
     @property
     def turning_radius_m(self) -> float:
-        """Of the arc that forward/left and forward/right drive."""
+        """Radius of the arc that a turning action drives."""
         return self.step_m / self.turn_rad
 
     def move(self, poses: Floats, action: int, part: float = 1.0) -> Floats:
@@ -141,7 +142,7 @@ class Planner:
         self._points = np.column_stack([x.ravel() + x0, y.ravel() + y0])
         room = world.clearance(self._points) - motion.radius_m
         self._room: Table = room.reshape(rows, columns).astype(np.float32)
-        self._way = [self._way_room(action) for action in range(3)]
+        self._way = [self._way_room(action) for action in range(ACTION_COUNT)]
         self._margin = self._margin_table(horizon)
         self._aims: dict[tuple[int, float], _Aim] = {}
 
@@ -226,7 +227,7 @@ class Planner:
             chosen = np.zeros(len(poses), np.int64)
             chosen[alive] = self._choose(poses[alive], aim)
             safe = np.zeros(len(poses), np.bool_)
-            for action in range(3):
+            for action in range(ACTION_COUNT):
                 mine = alive[chosen[alive] == action]
                 safe[mine] = self.motion.gap(self.world, poses[mine], action) > CONTACT_M
                 poses[mine] = self.motion.move(poses[mine], action)
@@ -241,7 +242,7 @@ class Planner:
     def _choose(self, poses: Floats, aim: _Aim | None) -> Ints:
         """The action with most room on its way and after it, or with most progress if safe."""
         scores = []
-        for action in range(3):
+        for action in range(ACTION_COUNT):
             after = self.motion.move(poses, action)
             room = np.minimum(
                 self._look_up(self._way[action], poses), self._look_up(self._margin, after)
@@ -256,7 +257,9 @@ class Planner:
         """Room kept at the narrowest place of the best run of `horizon` actions."""
         table = np.repeat(self._room[None], self._headings, axis=0)
         for _ in range(horizon):
-            best = [np.minimum(self._way[a], self._after(table, a, -1.0)) for a in range(3)]
+            best = [
+                np.minimum(self._way[a], self._after(table, a, -1.0)) for a in range(ACTION_COUNT)
+            ]
             new = np.minimum(table, np.maximum.reduce(best))
             if np.array_equal(new, table):
                 break
@@ -267,7 +270,7 @@ class Planner:
         """Discounted gain of the best safe run."""
         before = np.column_stack([self._points, np.zeros(len(self._points))])
         gains = []
-        for action in range(3):
+        for action in range(ACTION_COUNT):
             table = np.empty_like(self._margin)
             for h in range(self._headings):
                 before[:, 2] = h * self._heading_step
@@ -277,7 +280,7 @@ class Planner:
             gains.append(np.where(room > keep_m, table, np.float32(-np.inf)))
         table = np.zeros_like(self._margin)
         for _ in range(_SWEEPS):
-            best = [gains[a] + _DISCOUNT * self._after(table, a, 0.0) for a in range(3)]
+            best = [gains[a] + _DISCOUNT * self._after(table, a, 0.0) for a in range(ACTION_COUNT)]
             table = np.maximum(np.maximum.reduce(best), np.float32(_LOST))
         return table
 

@@ -21,6 +21,7 @@ from services.robot_driver.robot import Pose, Velocity
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import World, WorldError, read_world
 from shared.config import Config
+from shared.facts import IMAGE_HEIGHT, IMAGE_WIDTH
 
 __all__ = ["RandomDrive", "corridor_width", "drive_randomly", "problems_in", "survey"]
 
@@ -242,7 +243,7 @@ def _render_times(robot: SimRobot, repeats: int = 100) -> Figures:
 
     return {
         f"render_{width}x{height}_ms": _mean_ms(look(width, height), repeats)
-        for width, height in ((75, 50), (150, 100))
+        for width, height in ((IMAGE_WIDTH, IMAGE_HEIGHT), (2 * IMAGE_WIDTH, 2 * IMAGE_HEIGHT))
     }
 
 

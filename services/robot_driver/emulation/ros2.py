@@ -32,6 +32,7 @@ from services.robot_driver.real.link import Battery
 from services.robot_driver.real.picture import RgbImage
 from shared.config import RobotConfig
 from shared.errors import BadMessage, ConfigError, RouterMissing
+from shared.facts import IMAGE_HEIGHT, IMAGE_WIDTH
 from shared.foreign_bus import RawInbox, RawSample
 
 PERIODS_S = {"odometry": 0.05, "camera": 0.1, "bumper": 0.05, "battery": 0.5}
@@ -66,8 +67,8 @@ class EmulatedRos2:
         self._ros = config.ros2
         create3 = self._ros.bumper_type == "HazardDetectionVector"
         self.dynamics = replace(CREATE3 if create3 else ROBOTINO, watchdog_s=CREATE3.watchdog_s)
-        width = max(75, config.camera.render_width_px // SCALE)
-        height = max(50, config.camera.render_height_px // SCALE)
+        width = max(IMAGE_WIDTH, config.camera.render_width_px // SCALE)
+        height = max(IMAGE_HEIGHT, config.camera.render_height_px // SCALE)
         camera = config.camera.model_copy(
             update={"render_width_px": width, "render_height_px": height}
         )
