@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from shared.facts import ACTION_COUNT, IMAGE_BYTES, IMAGE_SHAPE, NAME
+from shared.facts import ACTION_COUNT, ACTIONS, IMAGE_BYTES, IMAGE_SHAPE, NAME
 
 PROTOCOL_VERSION = 1
 MAX_EPISODE_SAMPLES = 5000
@@ -104,8 +104,10 @@ class Action(Message):
     """Of the observation answered; the driver ignores any other than the one it waits on."""
     attempt: Count = 0
     """Of the observation answered."""
-    action: Annotated[int, Field(ge=0, lt=ACTION_COUNT)] | None
-    """Number of the action in the table of actions (A21); None: hold still for one period."""
+    action: Annotated[int, Field(ge=0, lt=ACTION_COUNT)] | None = Field(
+        description=", ".join(f"{number} {action.name}" for number, action in enumerate(ACTIONS))
+        + " (A21); None: hold still for one period."
+    )
     motion: Motion = ""
     """Instead of an action, which is None then: move like this for one period. A driver that cannot
     holds still. It counts as no action: `sequence` stays, and the next observation says "moved"."""

@@ -24,7 +24,7 @@ MAX_WEIGHT_BYTES = 64 * 1024 * 1024
 
 
 def _map_size(size: int) -> int:
-    """Height or width of the last maps of an image: valid padding, stride 1, floor pooling (E16)."""
+    """Height or width of the last maps: valid padding, stride 1, floor pooling (E16)."""
     for pooled in POOLED["ccpccp"]:  # the other layout comes to the same
         size = (size - 2) // (2 if pooled else 1)
     return size
