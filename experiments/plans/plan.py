@@ -49,7 +49,7 @@ class Stage(Section):
 
     name: Name
     until: Annotated[int, Field(ge=1)]
-    """Last episode of the stage, counted from the plan's first."""
+    """Last episode of the stage, counted from the first one of the plan."""
     config: Tree = Field(default_factory=dict)
     """What changes as the stage begins; later stages keep it."""
     force_candidates: bool = False
@@ -82,13 +82,13 @@ class Evaluation(Section):
     """Frozen drives during a run."""
 
     starts: Annotated[int, Field(ge=1, le=1000)] = 16
-    """At the end of a stage."""
+    """Start poses of the drive at the end of a stage."""
     actions: Annotated[int, Field(ge=50, le=100_000)] = 400
     every_actions: Annotated[int, Field(ge=1)] = 200_000
-    """On the way: how often."""
+    """Actions between two drives during a stage."""
     every_starts: Annotated[int, Field(ge=1, le=1000)] = 8
     every_length: Annotated[int, Field(ge=50, le=100_000)] = 200
-    """On the way: actions from each start."""
+    """Actions from each start of a drive during a stage."""
     lap_every_actions: Annotated[int, Field(ge=0)] = 0
     """How often to look whether the frozen policy drives a lap already, until it does; 0: never."""
     worlds: Annotated[tuple[Name, ...], Field(strict=False)] = ()
@@ -101,7 +101,7 @@ class Plan(Section):
     name: Name
     title: str
     source: str
-    """Where the thesis describes it."""
+    """The place where the thesis describes it."""
     after: str = ""
     """The plan whose end this one begins with: weights, optimiser, memory, robot (A46)."""
     preset: str = ""
@@ -163,7 +163,7 @@ def presentations(names: Iterable[str], folder: Traversable = PLANS) -> dict[str
 
 
 def read_plan(name: str, text: str, scale: Scale, folder: Traversable = PLANS) -> Plan:
-    """The same from the text of a file; `folder` has the plans it may be `like`.
+    """The plan in the text of a file; `folder` has the plans it may be `like`.
 
     Raises:
         ConfigError: The text is wrong.

@@ -27,7 +27,7 @@ class Company:
     """All experiments of one scale, and how their plans show them."""
 
     experiments: Mapping[str, Experiment]
-    """By name, in the order in which they are shown."""
+    """Experiments by name, in the order in which they are shown."""
     shown: Mapping[str, Presentation]
     scale: str
 

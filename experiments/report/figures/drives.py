@@ -66,13 +66,13 @@ def evaluation_curves(
 
 
 def evaluation_band(experiment: Experiment, world: str, panel: Panel) -> Band | None:
-    """The same of all seeds together, where all of them drove; None without drives."""
+    """The curves of all seeds together, where all of them drove; None without drives."""
     curves = evaluation_curves(experiment, world, panel)
     return band_between(curves) if curves else None
 
 
 def _unique(x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Of several drives after the same number of actions the last."""
+    """The last of several drives after the same number of actions."""
     last = np.append(x[1:] != x[:-1], True)
     return x[last], y[last]
 
