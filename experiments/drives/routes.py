@@ -109,12 +109,7 @@ def figure(
     sheet, (x0, y0, x1, y1) = Figure(dpi=DPI, layout="constrained"), world.bounds
     sheet.set_size_inches(WIDTH_IN, WIDTH_IN * (y1 - y0) / (x1 - x0) + LEGEND_IN)
     axes = sheet.subplots()
-    axes.set_facecolor(_SOLID)
-    for wall in world.walls:
-        face = _FREE if wall.area_m2 > 0.0 else _SOLID
-        axes.add_patch(Polygon(wall.points, facecolor=face, edgecolor=_INK, linewidth=1.2))
-    for obstacle in world.obstacles:
-        axes.add_patch(Polygon(obstacle.corners, facecolor=_BOX, edgecolor=_INK, linewidth=0.8))
+    _draw_world(axes, world)
     thin = len(traces) > 1
     axes.add_collection(LineCollection(
         [part for trace in traces for part in _driven(trace)],
@@ -136,6 +131,16 @@ def figure(
     sheet.legend(handles=_legend(traces, marks), loc="outside lower center", ncols=4, fontsize=9)
     _mark(axes, traces[0], events)
     return sheet
+
+
+def _draw_world(axes: Axes, world: World) -> None:
+    """Walls and boxes, seen from above."""
+    axes.set_facecolor(_SOLID)
+    for wall in world.walls:
+        face = _FREE if wall.area_m2 > 0.0 else _SOLID
+        axes.add_patch(Polygon(wall.points, facecolor=face, edgecolor=_INK, linewidth=1.2))
+    for obstacle in world.obstacles:
+        axes.add_patch(Polygon(obstacle.corners, facecolor=_BOX, edgecolor=_INK, linewidth=0.8))
 
 
 def _mark(axes: Axes, trace: Trace, events: Sequence[Event]) -> None:

@@ -5,10 +5,12 @@ No bus and no clock in here: the service and the single-process loop feed it obs
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from shared.config import Config
 from shared.messages import Action, Episode, Observation, RobotProgress, image_array
@@ -103,8 +105,8 @@ class Actor:
     def act(self, observation: Observation, values: Values | None = None) -> Action:
         """Choose an action with the current target network and append the step (A11, A26).
 
-        values: its clipped Q of all actions for this observation, float32 [3], where the caller
-        has already asked for them.
+        values: its clipped Q of all actions for this observation, float32 [actions], where the
+        caller has already asked for them.
         """
         assert self.progress is not None, "begin() comes first"
         if values is None:
@@ -120,23 +122,7 @@ class Actor:
             episode=episode,
             step=number,
         )
-        version = self.predictor.version
-        self.open.add(
-            Step(
-                image=observation.image,
-                action=action,
-                x_m=observation.x_m,
-                y_m=observation.y_m,
-                heading_rad=observation.heading_rad,
-                world=observation.world,
-                max_q=float(values.max()),
-                max_q_version=version,
-                acted_version=version,
-                number=number,
-                robot_episode=episode,
-                sequence=observation.sequence,
-            )
-        )
+        self._append(observation, action, float(values.max()), episode)
         self.actions += 1
         self.at_boundary = False
         self._expected = (observation.life, observation.sequence + 1)
@@ -148,12 +134,32 @@ class Actor:
             attempt=observation.attempt,
             action=action,
             greedy=greedy,
-            values=(float(values[0]), float(values[1]), float(values[2])),
-            weights_version=version,
+            values=tuple(map(float, values)),
+            weights_version=self.predictor.version,
             episode=progress.robot_episodes,
             filling=progress.filling,
             fills=progress.robot_fills,
             step=number,
+        )
+
+    def _append(self, observation: Observation, action: int, max_q: float, episode: int) -> None:
+        """Add a step to the open episode (A11)."""
+        version = self.predictor.version
+        self.open.add(
+            Step(
+                image=observation.image,
+                action=action,
+                x_m=observation.x_m,
+                y_m=observation.y_m,
+                heading_rad=observation.heading_rad,
+                world=observation.world,
+                max_q=max_q,
+                max_q_version=version,
+                acted_version=version,
+                number=len(self.open),
+                robot_episode=episode,
+                sequence=observation.sequence,
+            )
         )
 
     def state(self) -> dict[str, Any]:
@@ -211,6 +217,18 @@ class Actor:
         self._unreported_samples += max(samples, 0)
         self._unreported_episodes += episodes
 
+    def _rewards(self, steps: Sequence[Step], count: int, bump: bool) -> npt.NDArray[np.float32]:
+        """Rewards of the first `count` steps (Eq 3.1): float32 [count]."""
+        ahead = [step.max_q for step in steps[1 : count + 1]]
+        return episode_rewards(
+            np.array([(step.x_m, step.y_m) for step in steps]),
+            np.array(ahead + [0.0] * (count - len(ahead))),
+            bump=bump,
+            horizon=self._config.episode.horizon,
+            max_distance_m=self._config.max_distance_m,
+            config=self._config.reward,
+        )
+
     def _submission(self, release: Release, observation: Observation) -> Episode:
         version = self.predictor.version
         stale = stale_steps(release, version)
@@ -220,15 +238,7 @@ class Actor:
             values = self.predictor.all_values(images)
             steps = with_current_max_q(steps, values, stale, version)
         bump = release.ending == "bump"
-        ahead = [step.max_q for step in steps[1 : release.count + 1]]
-        rewards = episode_rewards(
-            np.array([(step.x_m, step.y_m) for step in steps]),
-            np.array(ahead + [0.0] * (release.count - len(ahead))),
-            bump=bump,
-            horizon=self._config.episode.horizon,
-            max_distance_m=self._config.max_distance_m,
-            config=self._config.reward,
-        )
+        rewards = self._rewards(steps, release.count, bump)
         actions, self._actions_before = self.actions - self._actions_before, self.actions
         laps = (observation.laps_left, observation.laps_right)
         before, self._laps_before = self._laps_before, laps

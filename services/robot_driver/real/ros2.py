@@ -59,14 +59,9 @@ class Ros2Link:
         self.bumper: Newest[bool] = Newest()
         self.battery: Newest[Battery] = Newest()
         self.faults: Counter[str] = Counter()
-        self._topics = {
-            "velocity": self._topic(self._ros.velocity_topic),
-            "bumper": self._topic(self._ros.bumper_topic),
-            "odometry": self._topic(self._ros.odometry_topic),
-            "camera": self._topic(self._ros.camera_topic),
-        }
-        if self._ros.battery_topic:
-            self._topics["battery"] = self._topic(self._ros.battery_topic)
+        parts = ("velocity", "bumper", "odometry", "camera", "battery")
+        topics = {part: getattr(self._ros, f"{part}_topic") for part in parts}
+        self._topics = {part: self._topic(topic) for part, topic in topics.items() if topic}
         self._kinds: dict[str, str] = {
             "bumper": self._ros.bumper_type,
             "odometry": "Odometry",

@@ -145,6 +145,25 @@ def velocity_type(
     Returns:
         Short type (empty when unknown), and an obstacle in one line (empty when there is none).
     """
+    chosen, obstacle = _chosen_type(configured, topic, listening, matching, transport)
+    if obstacle or matching[chosen]:
+        return chosen, obstacle
+    if listening and transport == "rmw-zenoh":
+        return chosen, (
+            f"robot listens for {chosen} on {topic} with another hash of the type: "
+            f"check robot.ros2.distribution"
+        )
+    return chosen, f"nothing on the robot listens on {topic}"
+
+
+def _chosen_type(
+    configured: str,
+    topic: str,
+    listening: frozenset[str],
+    matching: Mapping[str, bool],
+    transport: Literal["bridge", "rmw-zenoh"],
+) -> tuple[str, str]:
+    """Which type fits the configuration and those who listen, and why none does."""
     known = {name for name, full in VELOCITY_TYPES.items() if full in listening}
     told = " and ".join(sorted(short(name) for name in listening))
     # On the bridge's one key everybody gets what is sent: one listener of another type is too many.
@@ -152,29 +171,22 @@ def velocity_type(
     if configured != "auto":
         if listening and (configured not in known or not alone):
             return "", f"robot listens for {told} on {topic}, configured {configured}"
-        chosen = configured
-    elif listening:
+        return configured, ""
+    if listening:
         if len(known) != 1 or (transport == "bridge" and len(listening) > 1):
             return "", f"robot listens for {told} on {topic}, expected either Twist or TwistStamped"
         (chosen,) = known
-    else:
-        candidates = [name for name, matches in matching.items() if matches]
-        if not candidates:
-            return "", f"nothing on the robot listens on {topic}"
-        if transport == "bridge" or len(candidates) > 1:
-            return "", (
-                f"the network does not tell what the robot listens for on {topic}: "
-                f"set robot.ros2.velocity_type"
-            )
-        (chosen,) = candidates
-    if matching[chosen]:
         return chosen, ""
-    if listening and transport == "rmw-zenoh":
-        return chosen, (
-            f"robot listens for {chosen} on {topic} with another hash of the type: "
-            f"check robot.ros2.distribution"
+    candidates = [name for name, matches in matching.items() if matches]
+    if not candidates:
+        return "", f"nothing on the robot listens on {topic}"
+    if transport == "bridge" or len(candidates) > 1:
+        return "", (
+            f"the network does not tell what the robot listens for on {topic}: "
+            f"set robot.ros2.velocity_type"
         )
-    return chosen, f"nothing on the robot listens on {topic}"
+    (chosen,) = candidates
+    return chosen, ""
 
 
 def _bridged(letters: str, topic: str, type_name: str) -> Endpoint | None:
