@@ -1,0 +1,1 @@
+"""Running plans: stages, seeds side by side, snapshots, records."""
