@@ -13,8 +13,8 @@ from services.robot_driver.emulation.robotino import EmulatedRobotino, RobotinoS
 from services.robot_driver.emulation.robotino_faults import Faults
 from services.robot_driver.emulation.ros2 import EmulatedRos2
 from services.robot_driver.emulation.ros2_faults import Ros2Faults
+from services.robot_driver.kinds import make_robot
 from services.robot_driver.robot import NotReady, Pose, Robot
-from services.robot_driver.service import make_robot
 from shared.config import Config
 
 SPEED_M_S, TURN_RAD_S = 0.2, 0.6

@@ -7,14 +7,15 @@ sequence numbers, bumps, recovery and limits are decided here.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Literal
 
+from services.robot_driver.host import Host
 from services.robot_driver.recovery import Halted, WatchedRobot, back_off, let_go
 from services.robot_driver.robot import STANDSTILL, NotReady, Pose, Robot, Velocity
 from services.robot_driver.safety import Safety
-from services.robot_driver.world_changes import Changes, Outcome, described
+from services.robot_driver.world_changes import Outcome, WorldChanges, described
 from shared.config import Config
 from shared.facts import ACTIONS
 from shared.messages import (
@@ -53,26 +54,18 @@ def motion_velocity(config: Config, motion: Motion) -> Velocity:
 class Driver:
     """Executes actions one by one and tells what the robot perceives after each."""
 
-    def __init__(self, config: Config, robot: Robot, life: str) -> None:
-        self._config, self._robot = config, robot
+    def __init__(self, config: Config, robot: Robot, life: str, host: Host | None = None) -> None:
+        self._config, self._robot, self._host = config, robot, host or Host()
         self.life = life
         self.safety = Safety(config.robot)
         self.state: State = "waiting"
-        self.watch: Callable[[], None] = lambda: None
-        """Called while the robot recovers, so that commands take effect then too."""
-        self.stopping: Callable[[], bool] = lambda: False
-        """Whether the service is to stop: a recovery is broken off then (real time)."""
-        self.tell: Callable[[str], None] = lambda _line: None
-        """Called with what became of each change of the world, for a log."""
-        self.keep: Callable[[dict[str, Any]], None] = lambda _kept: None
-        """Called, before a change of the world is acknowledged, with what must outlive a kill."""
         self.sequence = 0
         self.attempt = 0
         self.bumps = self.recoveries = self.late_actions = self.refused_actions = 0
         self.resent_observations = self.refused_changes = self.blocks = 0
         self.reason = ""
         """Why the robot is not fit to drive; empty when it is."""
-        self._changes = Changes(robot)
+        self._changes = WorldChanges(robot.changeable)
         self._bump = False
         self._interruption: Interruption = ""
         self._moving = False
@@ -89,7 +82,7 @@ class Driver:
         """Sense now, as the observation that the next action answers. Raises RobotFault."""
         sensed = self._robot.sense()
         self._pose = sensed.pose
-        left, right = self._laps()
+        laps = self._robot.laps
         return Observation(
             robot=self._config.robot.id,
             life=self.life,
@@ -104,8 +97,8 @@ class Driver:
             world=self.world,
             period_s=self._config.robot.period_s,
             stamp_s=self._robot.now_s(),
-            laps_left=left,
-            laps_right=right,
+            laps_left=laps.left,
+            laps_right=laps.right,
         )
 
     def answers(self, action: Action) -> bool:
@@ -259,7 +252,7 @@ class Driver:
             self._refused(wish, str(error))
             return self._changes.answer(wish, str(error))
         outcomes = self._carry_out(0) if at_once else []
-        self.keep(self._changes.kept())
+        self._host.keep(self._changes.kept())
         refusal = next((outcome.refusal for outcome in outcomes if outcome.change is wish), "")
         return self._changes.answer(wish, refusal)
 
@@ -271,12 +264,12 @@ class Driver:
         """
         outcomes = self._carry_out(episode)
         if outcomes:
-            self.keep(self._changes.kept())
+            self._host.keep(self._changes.kept())
         return bool(outcomes)
 
     def report(self, undecodable: int) -> RobotState:
         """The heartbeat."""
-        left, right = self._laps()
+        laps = self._robot.laps
         halted: State | None = (
             "estop" if self.safety.estop else "paused" if self.safety.paused else None
         )
@@ -297,8 +290,8 @@ class Driver:
             refused_actions=self.refused_actions,
             resent_observations=self.resent_observations,
             undecodable=undecodable,
-            laps_left=left,
-            laps_right=right,
+            laps_left=laps.left,
+            laps_right=laps.right,
             pending_changes=len(self._changes.pending),
             refused_changes=self.refused_changes,
             blocks=self.blocks,
@@ -337,7 +330,7 @@ class Driver:
             self.look_again("restart")
 
     def restore_kept(self, kept: dict[str, Any]) -> None:
-        """Begin anew in the world that an earlier, killed driver gave to `keep`.
+        """Begin anew in the world that an earlier, killed driver gave to `Host.keep`.
 
         Raises KeyError, TypeError or ValueError when it does not fit.
         """
@@ -356,7 +349,7 @@ class Driver:
                 self._refused(outcome.change, outcome.refusal)
             else:
                 switched |= outcome.change.kind == "switch"
-                self.tell(f"world: {described(outcome.change)}")
+                self._host.tell(f"world: {described(outcome.change)}")
         if outcomes:
             self.halt()
             self.look_again("world" if switched else "")
@@ -364,15 +357,10 @@ class Driver:
 
     def _refused(self, change: WorldChange, reason: str) -> None:
         self.refused_changes += 1
-        self.tell(f"world: refused to {described(change)}: {reason}")
-
-    def _laps(self) -> tuple[int, int]:
-        laps = getattr(self._robot, "laps", None)  # only worlds that know have them
-        return (laps.left, laps.right) if laps else (0, 0)
+        self._host.tell(f"world: refused to {described(change)}: {reason}")
 
     def _faults(self) -> tuple[Fault, ...]:
-        faults = getattr(self._robot, "faults", None)  # only real robots have them
-        most = faults.most_common(MAX_FAULTS) if faults else ()
+        most = self._robot.faults.most_common(MAX_FAULTS)
         return tuple(Fault(name=name[:64], count=count) for name, count in most)
 
     def _count(self, *, executed: bool) -> None:
@@ -409,7 +397,7 @@ class Driver:
         """
         self.state = "recovering"
         slice_s = SLICE_S if self._realtime else None
-        robot = WatchedRobot(self._robot, self.safety, self.watch, slice_s, self.stopping)
+        robot = WatchedRobot(self._robot, self.safety, self._host, slice_s)
         try:
             yield robot
             if self._config.robot.kind != "sim":  # it still moves when told to stop

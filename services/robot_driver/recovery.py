@@ -7,9 +7,9 @@ bumper has one bit for the whole ring: a pressed bumper cannot tell front from r
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
-from services.robot_driver.robot import STANDSTILL, Pose, Robot, Velocity
+from services.robot_driver.host import Host
+from services.robot_driver.robot import STANDSTILL, ForwardingRobot, Pose, Robot, Velocity
 from services.robot_driver.safety import Safety
 from shared.config import RobotConfig
 
@@ -18,26 +18,16 @@ class Halted(Exception):
     """An operator or the end of the service stopped the robot while it recovered."""
 
 
-class WatchedRobot:
+class WatchedRobot(ForwardingRobot):
     """A robot during recovery: every command passes the limits, and an operator can stop it.
 
-    `watch` is called every `slice_s` while the robot moves; a motion ends by the robot's clock,
+    `host.look` is called every `slice_s` while the robot moves; a motion ends by the robot's clock,
     however long the looks take. With None it is one piece, as simulated time demands.
     """
 
-    def __init__(
-        self,
-        robot: Robot,
-        safety: Safety,
-        watch: Callable[[], None],
-        slice_s: float | None,
-        stopping: Callable[[], bool] = lambda: False,
-    ) -> None:
-        self._robot, self._safety = robot, safety
-        self._watch, self._slice_s, self._stopping = watch, slice_s, stopping
-        self.sense, self.feel = robot.sense, robot.feel
-        self.now_s, self.close = robot.now_s, robot.close
-        self.state, self.restore = robot.state, robot.restore
+    def __init__(self, robot: Robot, safety: Safety, host: Host, slice_s: float | None) -> None:
+        super().__init__(robot)
+        self._safety, self._host, self._slice_s = safety, host, slice_s
 
     def drive(self, velocity: Velocity) -> None:
         """Drive what the limits leave of this velocity."""
@@ -55,11 +45,11 @@ class WatchedRobot:
         while (left_s := end_s - self._robot.now_s()) > 1e-9:
             part_s = min(self._slice_s, left_s)
             contact |= self._robot.run(part_s, stop_on_contact=stop_on_contact)
-            self._look(stopping=self._stopping())
+            self._look(stopping=self._host.stopping)
         return contact
 
     def _look(self, *, stopping: bool) -> None:
-        self._watch()
+        self._host.look()
         if self._safety.halted or stopping:
             self._robot.drive(STANDSTILL)
             raise Halted

@@ -6,10 +6,15 @@ a robot only senses and moves.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections import Counter
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from shared.messages import ImageArray
+
+if TYPE_CHECKING:
+    from services.robot_driver.simulated.world import Obstacle, World
 
 
 @dataclass(frozen=True)
@@ -54,18 +59,54 @@ class Sensed(Felt):
     image: ImageArray
 
 
-class Robot(Protocol):
-    """A mobile base with one camera and a ring bumper."""
+class Laps(NamedTuple):
+    """Laps completed: net, anticlockwise (turning left round the island), clockwise."""
 
+    net: int
+    left: int
+    right: int
+
+
+class ChangeableWorld(Protocol):
+    """A world that can be changed between two actions: a simulated one."""
+
+    @property
+    def world(self) -> World:
+        """The world the robot drives in now."""
+
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """The boxes that stand in it now."""
+
+    def place(self, obstacle: Obstacle) -> None:
+        """Let a box stand there. Raises ValueError, nothing changed, when that cannot be."""
+
+    def remove(self, name: str) -> None:
+        """Take a box away. Raises ValueError when there is none of that name."""
+
+    def switch(self, world: World, start: int = 0) -> None:
+        """Stand at a start of another world. Raises ValueError, nothing changed."""
+
+
+class Robot(ABC):
+    """A mobile base with one camera and a ring bumper: everything a driver asks of it.
+
+    Laps, faults and a world to change have defaults, for robots that know of none.
+    """
+
+    @abstractmethod
     def sense(self) -> Sensed:
         """Read camera, odometry and bumper now. Raises RobotFault when a sensor cannot be read."""
 
+    @abstractmethod
     def feel(self) -> Felt:
         """Read odometry and bumper only: without the cost of a picture. Raises RobotFault."""
 
+    @abstractmethod
     def drive(self, velocity: Velocity) -> None:
         """Set the body velocity that holds until the next call. Raises RobotFault."""
 
+    @abstractmethod
     def run(self, duration_s: float, *, stop_on_contact: bool) -> bool:
         """Let `duration_s` pass: simulated, or real while the bumper is watched.
 
@@ -73,17 +114,90 @@ class Robot(Protocol):
         zero at the first contact and the rest of the time passes standing still.
         """
 
+    @abstractmethod
     def now_s(self) -> float:
         """Simulated time, or the monotonic clock."""
 
+    @abstractmethod
     def state(self) -> dict[str, float | int | str]:
         """Everything a later process needs to continue exactly here (empty on hardware)."""
 
+    @abstractmethod
     def restore(self, state: dict[str, float | int | str]) -> None:
         """Continue from `state()`. Raises ValueError when it does not fit this robot."""
 
+    @abstractmethod
     def close(self) -> None:
         """Stand still and let go of the robot. May be called twice."""
+
+    @property
+    def laps(self) -> Laps:
+        """Laps so far, for reports only."""
+        return Laps(0, 0, 0)
+
+    @property
+    def faults(self) -> Counter[str]:
+        """How often each fault occurred between the driver and its robot."""
+        return Counter()
+
+    @property
+    def changeable(self) -> ChangeableWorld | None:
+        """The robot's world, if it can be changed."""
+        return None
+
+
+class ForwardingRobot(Robot):
+    """A robot that passes everything on to another; subclasses replace what they do otherwise."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+
+    def sense(self) -> Sensed:
+        """Read the other robot's sensors."""
+        return self._robot.sense()
+
+    def feel(self) -> Felt:
+        """Read the other robot's odometry and bumper."""
+        return self._robot.feel()
+
+    def drive(self, velocity: Velocity) -> None:
+        """Set the other robot's velocity."""
+        self._robot.drive(velocity)
+
+    def run(self, duration_s: float, *, stop_on_contact: bool) -> bool:
+        """Let time pass for the other robot."""
+        return self._robot.run(duration_s, stop_on_contact=stop_on_contact)
+
+    def now_s(self) -> float:
+        """The other robot's clock."""
+        return self._robot.now_s()
+
+    def state(self) -> dict[str, float | int | str]:
+        """The other robot's state."""
+        return self._robot.state()
+
+    def restore(self, state: dict[str, float | int | str]) -> None:
+        """Restore the other robot."""
+        self._robot.restore(state)
+
+    def close(self) -> None:
+        """Close the other robot."""
+        self._robot.close()
+
+    @property
+    def laps(self) -> Laps:
+        """The other robot's laps."""
+        return self._robot.laps
+
+    @property
+    def faults(self) -> Counter[str]:
+        """The other robot's faults."""
+        return self._robot.faults
+
+    @property
+    def changeable(self) -> ChangeableWorld | None:
+        """The other robot's world, if it can be changed."""
+        return self._robot.changeable
 
 
 class RobotFault(Exception):

@@ -2,99 +2,38 @@
 
 from __future__ import annotations
 
-import functools
-import importlib
-import logging
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from services.robot_driver.driver import SLICE_S, Driver
-from services.robot_driver.robot import NotReady, Robot, RobotFault
+from services.robot_driver.host import Host
+from services.robot_driver.kinds import make_robot
+from services.robot_driver.robot import NotReady
 from shared import statefile
 from shared.bus import Inbox
 from shared.config import Config
-from shared.errors import ConfigError, RobotMissing, StateError
+from shared.errors import StateError
 from shared.keys import ACTION, OBSERVATION, ROBOT_COMMAND, ROBOT_STATE, ROBOT_WORLD
 from shared.messages import Action, Observation, RobotCommand, WorldChange
 from shared.service import TICK_S, Service, Stopped, new_life, service
 
-if TYPE_CHECKING:
-    from services.robot_driver.simulated.sim import Laps, SimRobot
-    from services.robot_driver.simulated.world import Obstacle, World
-
-log = logging.getLogger(__name__)
-
 STATE, WORLD = "state.msgpack", "world.msgpack"
 """Files of a robot: all of a driver that was stopped; its world, also of one that was killed."""
-
-
-LINKS = {"robotino": "RobotinoLink", "ros2": "Ros2Link"}
-"""Kinds of real robots: a module of `real` and a class in it."""
-
-
-def make_robot(config: Config) -> Robot:
-    """The robot of this configuration, simulated or real, ready to drive.
-
-    Raises:
-        ConfigError: A world that cannot be used, or a library that is not installed.
-        RobotMissing: The real robot does not answer.
-    """
-    kind = config.robot.kind
-    try:
-        return _simulated(config) if kind == "sim" else _real(config)
-    except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] in {"services", "shared"}:
-            raise
-        raise ConfigError(
-            f"driver: robot.kind {kind!r} needs the Python package {error.name}, which is not "
-            f"installed: pip install 'corridor[{kind}]'"
-        ) from error
-
-
-def _real(config: Config) -> Robot:
-    from services.robot_driver.real.hardware import HardwareRobot
-
-    kind = config.robot.kind
-    for name in ("camera_stale_s", "odometry_stale_s", "bumper_stale_s"):
-        if getattr(config.robot.hardware, name) > 2.0 * config.robot.period_s:
-            log.warning(
-                "robot.hardware.%s is longer than two robot.period_s: the robot stops later "
-                "than it could",
-                name,
-            )
-    module = importlib.import_module(f"services.robot_driver.real.{kind}")
-    link = getattr(module, LINKS[kind])(config)
-    try:
-        return HardwareRobot(config.robot, link)
-    except RobotFault as error:
-        raise RobotMissing(f"driver: {error}") from error
-
-
-def _simulated(config: Config) -> Robot:
-    from services.robot_driver.simulated.sim import SimRobot
-    from services.robot_driver.simulated.world import WorldError, load_world
-
-    try:
-        world = load_world(config.robot.world)
-        robot = SimRobot(config.robot, world, config.run.seed)
-    except (WorldError, ValueError) as error:
-        raise ConfigError(f"robot.world: {error}") from error
-    return PacedRobot(robot) if config.robot.timing == "realtime" else robot
 
 
 def run(config: Config, folder: Path) -> None:
     """Drive one robot until stopped; a clean stop saves where it is."""
     own = folder / "robot" / config.robot.id
     robot = make_robot(config)
-    driver = Driver(config, robot, new_life())
+    host = ServiceHost(own / WORLD)
+    driver = Driver(config, robot, new_life(), host)
     try:
         _restore(driver, own, config.robot.kind)
-        driver.keep = functools.partial(statefile.save, own / WORLD)
         # Stopped before it was up, it has driven nothing, but has taken up what was saved.
         with suppress(Stopped), service("driver", config.robot.id, config, life=driver.life) as me:
-            loop = DriverLoop(me, driver, folder)
+            loop = DriverLoop(me, driver, host, folder)
             try:
                 loop.run()
             finally:
@@ -123,11 +62,42 @@ def _restore(driver: Driver, own: Path, kind: str) -> None:
         raise StateError(f"{path}: saved state of the robot does not fit: {error}") from error
 
 
+class ServiceHost(Host):
+    """The service as its driver sees it. It has nothing to look at until its loop exists."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._loop: DriverLoop | None = None
+
+    def attach(self, loop: DriverLoop) -> None:
+        """Take commands and the end of the service from this loop from now on."""
+        self._loop = loop
+
+    @property
+    def stopping(self) -> bool:
+        """Whether the service is to stop."""
+        return self._loop is not None and self._loop.me.stop.is_set()
+
+    def look(self) -> None:
+        """Answer commands and publish the heartbeat."""
+        if self._loop is not None:
+            self._loop.beat()
+
+    def tell(self, line: str) -> None:
+        """Log what became of a change of the world."""
+        if self._loop is not None:
+            self._loop.me.log.info(line)
+
+    def keep(self, kept: dict[str, Any]) -> None:
+        """Write the robot's world to disk."""
+        statefile.save(self._path, kept)
+
+
 class DriverLoop:
     """Publishes observations and executes the actions that answer them."""
 
-    def __init__(self, me: Service, driver: Driver, folder: Path) -> None:
-        self._me, self._driver, self._config = me, driver, me.config
+    def __init__(self, me: Service, driver: Driver, host: ServiceHost, folder: Path) -> None:
+        self.me, self._driver, self._config = me, driver, me.config
         self._robot = me.config.robot.id
         self._inbox: Inbox = me.bus.inbox()
         self._inbox.subscribe(ACTION, self._robot)
@@ -137,14 +107,13 @@ class DriverLoop:
         self._next_beat_s = 0.0
         self._estop_mark = folder / "robot" / self._robot / "estop"
         driver.safety.estop |= self._estop_mark.exists()
-        driver.watch, driver.stopping = self.beat, me.stop.is_set
-        driver.tell = me.log.info
+        host.attach(self)
 
     def run(self) -> None:
         """Turn after turn until the service is to stop."""
         lockstep = self._config.robot.timing == "lockstep"
         turn = self._lockstep_turn if lockstep else self._realtime_turn
-        while not self._me.stop.is_set():
+        while not self.me.stop.is_set():
             turn()
 
     def beat(self, *, force: bool = False) -> None:
@@ -153,7 +122,7 @@ class DriverLoop:
             with request:
                 if isinstance(request.message, RobotCommand):
                     self._driver.command(request.message.command)
-                    self._me.log.info("operator: %s", request.message.command)
+                    self.me.log.info("operator: %s", request.message.command)
                     if problem := self._remember_estop():
                         request.refuse(problem)
                     else:
@@ -167,7 +136,7 @@ class DriverLoop:
         if force or now_s >= self._next_beat_s:
             self._next_beat_s = now_s + self._config.bus.heartbeat_s
             report = self._driver.report(self._inbox.refused_total)
-            self._me.bus.publish(ROBOT_STATE, report, self._robot)
+            self.me.bus.publish(ROBOT_STATE, report, self._robot)
 
     def _remember_estop(self) -> str:
         """Keep the latch on disk before it is acknowledged: not even kill -9 releases it.
@@ -185,7 +154,7 @@ class DriverLoop:
             released, safety.estop = not safety.estop, True
             self._driver.halt()
             what = "not cleared" if released else "stopped, but a restart would release it"
-            self._me.log.error("emergency stop: %s: %s", what, error)
+            self.me.log.error("emergency stop: %s: %s", what, error)
             return f"{what}: {error}"
         return ""
 
@@ -209,10 +178,10 @@ class DriverLoop:
         driver, attempt = self._driver, observation.attempt
         resend_s = 0.0
         sent = 0
-        while not self._me.stop.is_set() and driver.attempt == attempt:
+        while not self.me.stop.is_set() and driver.attempt == attempt:
             now_s = time.monotonic()
             if not driver.safety.halted and now_s >= resend_s:
-                self._me.bus.publish(OBSERVATION, observation, self._robot)
+                self.me.bus.publish(OBSERVATION, observation, self._robot)
                 driver.resent_observations += int(sent > 0)
                 sent, resend_s = sent + 1, now_s + self._config.robot.resend_s
             self._inbox.wait(min(TICK_S, max(resend_s - now_s, 0.01)))
@@ -235,15 +204,15 @@ class DriverLoop:
     def _stand_by(self) -> None:
         """Stand still, answering commands, until the robot is fit to drive again."""
         driver, told = self._driver, ""
-        while not self._me.stop.is_set():
+        while not self.me.stop.is_set():
             if driver.reason != told:
                 told = driver.reason
-                self._me.log.warning("stands still: %s", told)
+                self.me.log.warning("stands still: %s", told)
                 self.beat(force=True)
             self._inbox.wait(SLICE_S)
             self.beat()
             if driver.fit():
-                self._me.log.info("fit to drive again")
+                self.me.log.info("fit to drive again")
                 return
 
     def _control_period(self) -> None:
@@ -255,10 +224,10 @@ class DriverLoop:
         driver, period_s = self._driver, self._config.robot.period_s
         observation = driver.observe()
         if not driver.safety.halted:  # an answer could not be carried out
-            self._me.bus.publish(OBSERVATION, observation, self._robot)
+            self.me.bus.publish(OBSERVATION, observation, self._robot)
         left_s, started, hold, bump = period_s, False, False, False
         attempt = driver.attempt
-        while left_s > 1e-9 and not bump and not self._me.stop.is_set():
+        while left_s > 1e-9 and not bump and not self.me.stop.is_set():
             self.beat()
             if driver.attempt != attempt or driver.safety.halted:
                 break
@@ -294,37 +263,3 @@ class DriverLoop:
             driver.halt()
             driver.late_actions += int(not hold)
             driver.look_again("" if hold else "late")
-
-
-class PacedRobot:
-    """A simulated robot whose time runs like the clock on the wall."""
-
-    def __init__(self, robot: SimRobot) -> None:
-        self._robot = robot
-        self._due_s = time.monotonic()
-        self.sense, self.feel, self.drive = robot.sense, robot.feel, robot.drive
-        self.now_s, self.close = robot.now_s, robot.close
-        self.state, self.restore = robot.state, robot.restore
-        self.place, self.remove, self.switch = robot.place, robot.remove, robot.switch
-
-    @property
-    def world(self) -> World:
-        """The simulated world."""
-        return self._robot.world
-
-    @property
-    def obstacles(self) -> tuple[Obstacle, ...]:
-        """What stands in it."""
-        return self._robot.obstacles
-
-    @property
-    def laps(self) -> Laps:
-        """As the simulated robot counts them."""
-        return self._robot.laps
-
-    def run(self, duration_s: float, *, stop_on_contact: bool) -> bool:
-        """Simulate, then wait until the wall clock has caught up."""
-        contact = self._robot.run(duration_s, stop_on_contact=stop_on_contact)
-        self._due_s = max(self._due_s, time.monotonic() - duration_s) + duration_s
-        time.sleep(max(0.0, self._due_s - time.monotonic()))
-        return contact

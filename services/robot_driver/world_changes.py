@@ -10,11 +10,11 @@ from bisect import insort
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from pydantic import ValidationError
 
-from services.robot_driver.robot import Robot
+from services.robot_driver.robot import ChangeableWorld
 from services.robot_driver.simulated.world import (
     MAX_OBSTACLES,
     Obstacle,
@@ -32,28 +32,6 @@ MAX_REMEMBERED = 64
 """Answers kept for wishes that are sent again because the answer was lost."""
 
 
-@runtime_checkable
-class Changeable(Protocol):
-    """A robot in a world that can be changed between actions: a simulated one."""
-
-    @property
-    def world(self) -> World:
-        """The world it drives in now."""
-
-    @property
-    def obstacles(self) -> tuple[Obstacle, ...]:
-        """What stands in it now."""
-
-    def place(self, obstacle: Obstacle) -> None:
-        """Let a box stand there. Raises ValueError, nothing changed, when that cannot be."""
-
-    def remove(self, name: str) -> None:
-        """Take a box away. Raises ValueError when there is none of that name."""
-
-    def switch(self, world: World, start: int = 0) -> None:
-        """Stand at a start of another world. Raises ValueError, nothing changed."""
-
-
 @dataclass(frozen=True)
 class Outcome:
     """What became of a change that was due."""
@@ -63,15 +41,15 @@ class Outcome:
     """Why it could not be carried out; empty if it was."""
 
 
-class Changes:
+class WorldChanges:
     """The changes of one robot's world.
 
     Args:
-        robot: Whose world it is; every change is refused unless it is `Changeable`.
+        robot: The robot whose world it is; with None every change is refused.
     """
 
-    def __init__(self, robot: Robot) -> None:
-        self._robot = robot if isinstance(robot, Changeable) else None
+    def __init__(self, robot: ChangeableWorld | None) -> None:
+        self._robot = robot
         self._pending: list[WorldChange] = []
         self._answers: OrderedDict[str, WorldChanged] = OrderedDict()
 
@@ -161,7 +139,7 @@ class Changes:
         if robot is not None and (kept["world"], obstacles) != (robot.world.name, robot.obstacles):
             _furnish(robot, _world(kept["world"]), obstacles)
 
-    def _check(self, change: WorldChange, robot: Changeable) -> None:
+    def _check(self, change: WorldChange, robot: ChangeableWorld) -> None:
         """Against the world there will be when it is due, if no other changes come between."""
         world, names = robot.world, {obstacle.name for obstacle in robot.obstacles}
         for earlier in self._pending:
@@ -217,7 +195,7 @@ def described(change: WorldChange) -> str:
     return f"switch to world {change.world!r}, start {change.start}"
 
 
-def _furnish(robot: Changeable, world: World, obstacles: tuple[Obstacle, ...]) -> None:
+def _furnish(robot: ChangeableWorld, world: World, obstacles: tuple[Obstacle, ...]) -> None:
     """Put a robot into a world with just these obstacles. Raises ValueError."""
     for start in range(len(world.starts)):
         try:

@@ -12,6 +12,7 @@ from robots import SPEED_M_S, SUBJECTS, TURN_RAD_S, Subject
 from waiting import wait_until
 
 from services.robot_driver.driver import Driver
+from services.robot_driver.host import Host
 from services.robot_driver.recovery import WatchedRobot, back_off
 from services.robot_driver.robot import STANDSTILL, NotReady, Pose, Velocity
 from services.robot_driver.safety import Safety
@@ -126,7 +127,7 @@ def test_contact_stops_it_and_recovery_frees_it(subject: Subject) -> None:
     subject.robot.run(0.5, stop_on_contact=False)
     assert subject.true_pose() == pressed
     robot = subject.config.robot
-    watched = WatchedRobot(subject.robot, Safety(robot), lambda: None, 0.02)
+    watched = WatchedRobot(subject.robot, Safety(robot), Host(), 0.02)
     back_off(watched, robot, subject.robot.feel().pose.heading_rad + 1.0)
     rest(subject)
     wait_until(lambda: not subject.robot.feel().contact, 20, "the bumper is free")
@@ -134,7 +135,7 @@ def test_contact_stops_it_and_recovery_frees_it(subject: Subject) -> None:
 
 
 def test_a_wish_that_is_no_velocity_is_standstill(subject: Subject) -> None:
-    watched = WatchedRobot(subject.robot, Safety(subject.config.robot), lambda: None, 0.02)
+    watched = WatchedRobot(subject.robot, Safety(subject.config.robot), Host(), 0.02)
     place = subject.true_pose()
     for bad in (math.nan, math.inf):
         watched.drive(Velocity(bad, 0.0, 0.0))

@@ -21,6 +21,7 @@ from services.robot_driver.robot import (
     Felt,
     NotReady,
     Pose,
+    Robot,
     RobotFault,
     Sensed,
     Velocity,
@@ -37,7 +38,7 @@ T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 
-class HardwareRobot:
+class HardwareRobot(Robot):
     """A robot as `robot.Robot`, reached through a link.
 
     Args:

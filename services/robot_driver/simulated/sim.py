@@ -11,13 +11,21 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import TypeAdapter, ValidationError
 
-from services.robot_driver.robot import STANDSTILL, Felt, Pose, Sensed, Velocity
+from services.robot_driver.robot import (
+    STANDSTILL,
+    ChangeableWorld,
+    Felt,
+    Laps,
+    Pose,
+    Robot,
+    Sensed,
+    Velocity,
+)
 from services.robot_driver.simulated.scene import Scene
 from services.robot_driver.simulated.world import (
     MAX_OBSTACLES,
@@ -42,14 +50,6 @@ _HALVINGS = 6
 """Of a substep that would touch: what is left of 1 cm is well inside the skin."""
 
 
-class Laps(NamedTuple):
-    """Laps completed: net, anticlockwise (turning left round the island), clockwise."""
-
-    net: int
-    left: int
-    right: int
-
-
 def wrap(angle_rad: float) -> float:
     """The same direction in -pi..pi."""
     return math.remainder(angle_rad, 2.0 * math.pi)
@@ -69,7 +69,7 @@ def advance(pose: Pose, velocity: Velocity, duration_s: float) -> Pose:
     )
 
 
-class SimRobot:
+class SimRobot(Robot):
     """A Robotino in a world, as `robot.Robot`; deterministic and without noise.
 
     Args:
@@ -109,6 +109,11 @@ class SimRobot:
     def laps(self) -> Laps:
         """Laps so far; one counts when 2 pi of new net angle round the lap centre is reached."""
         return Laps(self._left - self._right, self._left, self._right)
+
+    @property
+    def changeable(self) -> ChangeableWorld:
+        """The robot itself: its world can be changed."""
+        return self
 
     def frame(self, width_px: int = 0, height_px: int = 0) -> npt.NDArray[np.uint8]:
         """The camera picture before preprocessing: uint8 [h, w, 3], RGB."""

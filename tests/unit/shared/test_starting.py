@@ -13,6 +13,7 @@ import pytest
 
 from services.robot_driver import service as driver_service
 from services.robot_driver.driver import Driver
+from services.robot_driver.kinds import make_robot
 from shared import statefile
 from shared.config import Config
 from shared.service import StopFlag, Stopped, answer_signals, starting
@@ -52,7 +53,7 @@ def test_a_driver_stopped_before_it_is_up_keeps_what_it_was_to_continue(
 ) -> None:
     config = Config()
     path = tmp_path / "robot" / config.robot.id / driver_service.STATE
-    robot = driver_service.make_robot(config)
+    robot = make_robot(config)
     driver = Driver(config, robot, "a" * 12)
     for action in (0, 1, 1, 2):
         driver.execute(action)

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from services.commander.commander import refuse_others
 from services.commander.drive import DriveTally
 from services.robot_driver.driver import Driver, motion_velocity
-from services.robot_driver.robot import STANDSTILL, Felt, Velocity
+from services.robot_driver.robot import STANDSTILL, Felt, ForwardingRobot, Velocity
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import load_world
 from shared.config import Config
@@ -29,15 +29,14 @@ FAST = settings(deadline=None, max_examples=60, derandomize=True)
 MOTIONS: list[Motion] = ["turn-left", "turn-right", "forward", "back"]
 
 
-class Watched:
+class Watched(ForwardingRobot):
     """A robot that notes its velocities; the rest is the simulated one's."""
 
     def __init__(self, config: Config) -> None:
         self.sim = SimRobot(config.robot, load_world("minus"), 1)
+        super().__init__(self.sim)
         self.told: list[Velocity] = []
         self.pressed = False
-        self.sense, self.run, self.now_s = self.sim.sense, self.sim.run, self.sim.now_s
-        self.state, self.restore, self.close = self.sim.state, self.sim.restore, self.sim.close
 
     def feel(self) -> Felt:
         felt = self.sim.feel()

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.robot_driver.driver import Driver, action_velocity
-from services.robot_driver.robot import STANDSTILL, Felt, Pose, Sensed, Velocity
+from services.robot_driver.robot import STANDSTILL, Felt, Pose, Robot, Sensed, Velocity
 from services.robot_driver.safety import Safety
 from shared.config import Config, RobotConfig
 from shared.messages import Action
@@ -22,7 +22,7 @@ LIFE = "a" * 12
 CONFIG = Config(robot=RobotConfig(id="robot1", turn_rad_s=1.0, deadman_s=0.6))
 
 
-class ScriptedRobot:
+class ScriptedRobot(Robot):
     """Stands on a plane; `contacts` tells, for each stretch of time to come, whether it bumps."""
 
     def __init__(self) -> None:

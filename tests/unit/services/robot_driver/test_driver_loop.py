@@ -18,11 +18,12 @@ from waiting import wait_until
 
 from services.robot_driver import service
 from services.robot_driver.driver import SLICE_S, Driver
+from services.robot_driver.host import Host
 from services.robot_driver.real.hardware import HardwareRobot
 from services.robot_driver.recovery import WatchedRobot, back_off
 from services.robot_driver.robot import STANDSTILL, Felt, Pose, Velocity
 from services.robot_driver.safety import Safety
-from services.robot_driver.service import DriverLoop
+from services.robot_driver.service import DriverLoop, ServiceHost
 from shared.config import Config
 from shared.keys import OBSERVATION, Stream
 from shared.messages import Action, Motion, Observation, RobotCommand
@@ -98,13 +99,14 @@ class Stand:
 
     def __init__(self, folder: Path, config: Config) -> None:
         self.link, self.bus, self.folder = FakeLink(), FakeBus(), folder
+        host = ServiceHost(folder / "world")
         self.robot = HardwareRobot(config.robot, self.link)
-        self.driver = Driver(config, self.robot, LIFE)
+        self.driver = Driver(config, self.robot, LIFE, host)
         self.stop = StopFlag()
         me: Any = SimpleNamespace(
             stop=self.stop, log=logging.getLogger("test"), bus=self.bus, config=config
         )
-        self.loop = DriverLoop(me, self.driver, folder)
+        self.loop = DriverLoop(me, self.driver, host, folder)
         self.thread = threading.Thread(target=self.loop.run)
         self.thread.start()
 
@@ -255,7 +257,7 @@ def test_a_stop_within_an_action_is_told_however_soon_it_is_released(tmp_path: P
 def test_a_slow_driver_drives_no_farther_back(look_s: float) -> None:
     """The way of a recovery is limited by the robot's clock, not by the number of looks."""
 
-    class Clock:
+    class Clock(Host):
         now, moved_s = 0.0, 0.0
         sense = feel = state = restore = close = lambda *_: None
         drive = lambda *_: None  # noqa: E731
@@ -271,7 +273,7 @@ def test_a_slow_driver_drives_no_farther_back(look_s: float) -> None:
             self.now += look_s
 
     clock: Any = Clock()
-    robot = WatchedRobot(clock, Safety(CONFIG.robot), clock.look, SLICE_S)
+    robot = WatchedRobot(clock, Safety(CONFIG.robot), clock, SLICE_S)
     robot.run(1.0, stop_on_contact=False)
     assert 1.0 - 1e-9 <= clock.now <= 1.0 + SLICE_S + look_s
 

@@ -13,7 +13,17 @@ from hypothesis import strategies as st
 
 from services.actor.actor import Actor
 from services.robot_driver.driver import Driver
-from services.robot_driver.robot import STANDSTILL, Felt, Pose, Sensed, Velocity
+from services.robot_driver.host import Host
+from services.robot_driver.robot import (
+    STANDSTILL,
+    ChangeableWorld,
+    Felt,
+    ForwardingRobot,
+    Pose,
+    Robot,
+    Sensed,
+    Velocity,
+)
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import Obstacle, World, load_world
 from services.robot_driver.world_changes import MAX_PENDING
@@ -25,7 +35,7 @@ CONFIG = make_config(robot={"id": "robot1"}, episode={"max_samples": 12, "horizo
 FAST = settings(deadline=None, max_examples=40, derandomize=True)
 
 
-class Figurine:
+class Figurine(Robot):
     """Moves along a line; keeps its world and boxes like a simulated robot, without seeing them."""
 
     def __init__(self) -> None:
@@ -63,6 +73,10 @@ class Figurine:
     def close(self) -> None:
         self.velocity = STANDSTILL
 
+    @property
+    def changeable(self) -> ChangeableWorld | None:
+        return self
+
     def place(self, obstacle: Obstacle) -> None:
         if self.blocked:
             raise ValueError("it would overlap the robot")
@@ -78,26 +92,36 @@ class Figurine:
         self.done.append(f"{world.name}{start}")
 
 
-class Plain:
+class Plain(ForwardingRobot):
     """A robot without a world, as hardware is."""
 
+    changeable = None
+
+
+class Notes(Host):
+    """Notes what the driver tells and keeps."""
+
     def __init__(self) -> None:
-        self._robot = Figurine()
-        robot = self._robot
-        self.sense, self.feel, self.drive, self.run = (
-            robot.sense,
-            robot.feel,
-            robot.drive,
-            robot.run,
-        )
-        self.now_s, self.state, self.restore = robot.now_s, robot.state, robot.restore
-        self.close = robot.close
+        self.told: list[str] = []
+        self.kept: list[dict[str, Any]] = []
+
+    def tell(self, line: str) -> None:
+        self.told.append(line)
+
+    def keep(self, kept: dict[str, Any]) -> None:
+        self.kept.append(msgpack.unpackb(msgpack.packb(kept)))
+
+
+def notes(driver: Driver) -> Notes:
+    host = driver._host
+    assert isinstance(host, Notes)
+    return host
 
 
 def make_driver(**robot: Any) -> tuple[Driver, Figurine]:
     config = CONFIG.model_copy(update={"robot": CONFIG.robot.model_copy(update=robot)})
     figurine = Figurine()
-    return Driver(config, figurine, LIFE), figurine
+    return Driver(config, figurine, LIFE, Notes()), figurine
 
 
 def box(name: str = "box", **given: Any) -> WorldChange:
@@ -215,8 +239,8 @@ def test_what_cannot_be_is_refused_at_once_counted_and_told(wish: WorldChange, r
     driver.change(gone("there", at_episode=4))
     driver.change(switch(at_episode=6))
     driver.change(box("boxes", x_m=0.0, y_m=0.0, at_episode=7))
-    told: list[str] = []
-    driver.tell = told.append
+    told = notes(driver).told
+    told.clear()
     answer = driver.change(wish, at_once=True)
     assert not answer.accepted
     assert reason in answer.reason
@@ -230,8 +254,7 @@ def test_what_cannot_be_is_refused_at_once_counted_and_told(wish: WorldChange, r
 
 def test_what_turns_out_impossible_when_due_is_counted_told_and_looked_at_again() -> None:
     driver, robot = make_driver()
-    told: list[str] = []
-    driver.tell = told.append
+    told = notes(driver).told
     driver.change(box(at_episode=2))
     driver.change(switch(at_episode=2))
     robot.blocked = True
@@ -246,7 +269,7 @@ def test_what_turns_out_impossible_when_due_is_counted_told_and_looked_at_again(
 
 
 def test_a_robot_without_a_world_refuses_changes_and_names_the_configured_world() -> None:
-    driver = Driver(CONFIG, Plain(), LIFE)
+    driver = Driver(CONFIG, Plain(Figurine()), LIFE)
     answer = driver.change(switch(), at_once=True)
     assert (answer.accepted, answer.world) == (False, "")
     assert answer.reason == "the world of this robot cannot be changed"
@@ -296,15 +319,9 @@ def test_damaged_changes_are_refused() -> None:
         driver.restore({**driver.saved(), "changes": [b"\xc1"]})
 
 
-def kept_by(driver: Driver) -> list[dict[str, Any]]:
-    kept: list[dict[str, Any]] = []
-    driver.keep = lambda state: kept.append(msgpack.unpackb(msgpack.packb(state)))
-    return kept
-
-
 def test_world_obstacles_and_what_waits_outlive_a_killed_driver() -> None:
     driver, _ = make_driver()
-    kept = kept_by(driver)
+    kept = notes(driver).kept
     driver.change(switch(), at_once=True)
     driver.change(box("b", x_m=0.0, y_m=0.0), at_once=True)
     driver.change(switch("maze"))
@@ -328,7 +345,7 @@ def test_world_obstacles_and_what_waits_outlive_a_killed_driver() -> None:
 )
 def test_a_damaged_kept_world_is_refused(damage: dict[str, Any]) -> None:
     driver, _ = make_driver()
-    kept = kept_by(driver)
+    kept = notes(driver).kept
     driver.change(box(), at_once=True)
     with pytest.raises(ValueError, match=r"changes|no world named|Field required"):
         make_driver()[0].restore_kept({**kept[-1], **damage})
@@ -340,8 +357,8 @@ def test_a_robot_whose_first_start_is_blocked_begins_at_the_next() -> None:
     config = CONFIG.model_copy(update={"robot": RobotConfig(id="robot1")})
     robots = [SimRobot(config.robot, load_world("plus"), 1) for _ in range(2)]
     try:
-        driver = Driver(config, robots[0], LIFE)
-        kept = kept_by(driver)
+        driver = Driver(config, robots[0], LIFE, Notes())
+        kept = notes(driver).kept
         driver.change(switch("plus", start=2), at_once=True)
         driver.change(box(y_m=0.1), at_once=True)
         Driver(config, robots[1], LIFE).restore_kept(kept[-1])

@@ -12,10 +12,10 @@ from fake_link import FakeLink, config_of
 from waiting import wait_until
 
 from services.robot_driver.driver import Driver, action_velocity
+from services.robot_driver.kinds import make_robot
 from services.robot_driver.real.gate import ZEROS
 from services.robot_driver.real.hardware import HardwareRobot
 from services.robot_driver.robot import STANDSTILL, NotReady, Pose, RobotFault, Velocity
-from services.robot_driver.service import make_robot
 from shared.config import Config, RobotConfig
 from shared.errors import ConfigError, RobotMissing
 from shared.keys import ROBOT_STATE

@@ -1,0 +1,23 @@
+"""What a driver needs of the process it runs in; the driver itself knows no bus and no disk."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+class Host:
+    """The surroundings of a driver. This one, for loops without a service, has none."""
+
+    @property
+    def stopping(self) -> bool:
+        """Whether the process is to stop: in real time a recovery is broken off then."""
+        return False
+
+    def look(self) -> None:
+        """Take up commands; called again and again while the robot recovers."""
+
+    def tell(self, line: str) -> None:
+        """Log what became of a change of the world."""
+
+    def keep(self, kept: dict[str, Any]) -> None:
+        """Save what must outlive a kill, before a change of the world is acknowledged."""

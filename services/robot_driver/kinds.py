@@ -1,0 +1,82 @@
+"""The kinds of robots there are, and how one of them is made ready to drive."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+from typing import NamedTuple
+
+from services.robot_driver.robot import Robot, RobotFault
+from shared.config import Config
+from shared.errors import ConfigError, RobotMissing
+
+log = logging.getLogger(__name__)
+
+
+class Kind(NamedTuple):
+    """A kind of real robot: how it is reached, and what must be installed for it."""
+
+    module: str
+    """The module with its link, in `services.robot_driver.real`."""
+    link: str
+    """The class in it, a `real.link.Link`."""
+    extra: str
+    """The extra of this package that its libraries come with."""
+
+
+REAL = {
+    "robotino": Kind("robotino", "RobotinoLink", "robotino"),
+    "ros2": Kind("ros2", "Ros2Link", "ros2"),
+}
+"""Real robots by `robot.kind`; every other kind is the simulation."""
+
+
+def make_robot(config: Config) -> Robot:
+    """The robot of this configuration, simulated or real, ready to drive.
+
+    Raises:
+        ConfigError: A world that cannot be used, or a library that is not installed.
+        RobotMissing: The real robot does not answer.
+    """
+    kind = config.robot.kind
+    try:
+        return _simulated(config) if kind == "sim" else _real(config)
+    except ModuleNotFoundError as error:
+        if (error.name or "").split(".")[0] in {"services", "shared"}:
+            raise
+        raise ConfigError(
+            f"driver: robot.kind {kind!r} needs the Python package {error.name}, which is not "
+            f"installed: pip install 'corridor[{REAL[kind].extra if kind in REAL else kind}]'"
+        ) from error
+
+
+def _real(config: Config) -> Robot:
+    from services.robot_driver.real.hardware import HardwareRobot
+
+    kind = REAL[config.robot.kind]
+    for name in ("camera_stale_s", "odometry_stale_s", "bumper_stale_s"):
+        if getattr(config.robot.hardware, name) > 2.0 * config.robot.period_s:
+            log.warning(
+                "robot.hardware.%s is longer than two robot.period_s: the robot stops later "
+                "than it could",
+                name,
+            )
+    module = importlib.import_module(f"services.robot_driver.real.{kind.module}")
+    link = getattr(module, kind.link)(config)
+    try:
+        return HardwareRobot(config.robot, link)
+    except RobotFault as error:
+        raise RobotMissing(f"driver: {error}") from error
+
+
+def _simulated(config: Config) -> Robot:
+    from services.robot_driver.simulated.paced import PacedRobot
+    from services.robot_driver.simulated.sim import SimRobot
+    from services.robot_driver.simulated.world import WorldError, load_world
+
+    try:
+        world = load_world(config.robot.world)
+        robot = SimRobot(config.robot, world, config.run.seed)
+    except (WorldError, ValueError) as error:
+        raise ConfigError(f"robot.world: {error}") from error
+    return PacedRobot(robot) if config.robot.timing == "realtime" else robot

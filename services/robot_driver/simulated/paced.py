@@ -1,0 +1,22 @@
+"""Simulated time at the pace of the wall clock."""
+
+from __future__ import annotations
+
+import time
+
+from services.robot_driver.robot import ForwardingRobot, Robot
+
+
+class PacedRobot(ForwardingRobot):
+    """A simulated robot whose time runs like the clock on the wall."""
+
+    def __init__(self, robot: Robot) -> None:
+        super().__init__(robot)
+        self._due_s = time.monotonic()
+
+    def run(self, duration_s: float, *, stop_on_contact: bool) -> bool:
+        """Simulate, then wait until the wall clock has caught up."""
+        contact = self._robot.run(duration_s, stop_on_contact=stop_on_contact)
+        self._due_s = max(self._due_s, time.monotonic() - duration_s) + duration_s
+        time.sleep(max(0.0, self._due_s - time.monotonic()))
+        return contact
