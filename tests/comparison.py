@@ -54,8 +54,8 @@ def distributed(config: Config, folder: Path) -> Outcome:
     storage = Storage(folder / "replay", config.memory, f"{config.run.name}/{config.run.seed}")
     digests, commit = [], 0
     while (pending := storage.pending(commit)) is not None:
-        commit = pending[0].commit
-        digests.append((pending[0].episode, str(pending[1]["digest"])))
+        commit = pending.commit.commit
+        digests.append((pending.commit.episode, str(pending.record["digest"])))
     memory, position = storage.load(), storage.position()
     storage.close()
     path = folder / "learner" / "checkpoint.safetensors"

@@ -13,7 +13,7 @@ config = read_folder(folder)
 storage = Storage(folder / "replay", config.memory, f"{config.run.name}/{config.run.seed}")
 records: list[dict[str, Any]] = []
 while (pending := storage.pending(len(records))) is not None:
-    records.append(pending[1])
+    records.append(pending.record)
 memory = storage.load()
 memory.check_valid()
 counters = storage.counters()

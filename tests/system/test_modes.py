@@ -22,7 +22,7 @@ def read_records(cluster: Cluster) -> list[dict[str, object]]:
     storage = Storage(cluster.folder / "replay", config.memory, f"{config.run.name}/7")
     records = []
     while (pending := storage.pending(len(records))) is not None:
-        records.append(pending[1])
+        records.append(pending.record)
     storage.load().check_valid()
     storage.close()
     return records

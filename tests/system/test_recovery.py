@@ -40,7 +40,7 @@ def test_killed_mid_episode_loses_only_the_open_episode(victim: str, tmp_path: P
     counters = storage.counters()
     records = []
     while (pending := storage.pending(len(records))) is not None:
-        records.append(pending[1])
+        records.append(pending.record)
     memory = storage.load()
     storage.close()
     memory.check_valid()
