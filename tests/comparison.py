@@ -52,10 +52,7 @@ def single_process(config: Config, episodes: int, changes: Sequence[WorldChange]
 def distributed(config: Config, folder: Path) -> Outcome:
     """Read what the services left in a run folder."""
     storage = Storage(folder / "replay", config.memory, f"{config.run.name}/{config.run.seed}")
-    digests, commit = [], 0
-    while (pending := storage.pending(commit)) is not None:
-        commit = pending.commit.commit
-        digests.append((pending.commit.episode, str(pending.record["digest"])))
+    digests = [(int(r["commit"]["episode"]), str(r["digest"])) for r in storage.records()]
     memory, position = storage.load(), storage.position()
     storage.close()
     path = folder / "learner" / "checkpoint.safetensors"

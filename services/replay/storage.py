@@ -139,11 +139,10 @@ class Storage:
             rows, images = tables.rows(txn, list(ids))
             return Submission(commit, record, rows, images, list(tables.meta(txn, "worlds")))
 
-    def records(self, after: int) -> list[dict[str, Any]]:
-        """Records of all counted episodes beyond global number `after`, in order."""
+    def records(self) -> list[dict[str, Any]]:
+        """Return the records of all submissions in order, also of those whose samples are gone."""
         with self._tables.env.begin() as txn:
-            records = [unpack(data) for _, data in txn.cursor(self._tables.db["commits"])]
-        return [r for r in records if r["commit"]["episode"] > after]
+            return [unpack(data) for _, data in txn.cursor(self._tables.db["commits"])]
 
     def apply_turn(
         self, submission: Submission, memory: ReplayMemory, done: Maintenance

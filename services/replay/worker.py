@@ -191,10 +191,12 @@ class TurnWorker(threading.Thread):
         processed = self.view.position.processed
         written = {int(row["episode"]): row for row in self._metrics.kept(2**62)}
         rows: list[dict[str, int | float | str]] = []
-        for record in self._storage.records(0):
+        for record in self._storage.records():
             commit = Commit(**record["commit"])
             if commit.commit > processed:
                 break
+            if not commit.episode:
+                continue
             self._recent.append(int(record["fitness"]))
             rows.append({**written.get(commit.episode, {}), **self._basic_row(commit, record)})
         self._metrics.restart(rows)

@@ -414,8 +414,8 @@ def test_records_and_turns_list_counted_episodes_in_order() -> None:
             b.commit(make_episode(seed, seed=seed, images=some_images(seed, seed), ended=ended))
         while b.turn():
             pass
-        assert [r["commit"]["episode"] for r in b.storage.records(0)] == [1, 2, 3, 4, 5]
-        assert [r["fitness"] for r in b.storage.records(3)] == [4, 5]
+        assert [r["commit"]["episode"] for r in b.storage.records()] == [0, 1, 2, 3, 4, 5]
+        assert [r["fitness"] for r in b.storage.records()] == [30, 1, 2, 3, 4, 5]
         turns = b.storage.turns(0, 100)
         assert [(t.episode, t.bump, t.samples, t.actions) for t in turns] == [
             (n, bool(n % 2), n, n) for n in range(1, 6)
