@@ -70,10 +70,10 @@ def fill(folder: Path, config: Config, images: Images | None = None) -> int:
         storage.commit(make_episode(number, EPISODE_SAMPLES, fill=True, images=some))
         pending = storage.pending(number)
         assert pending is not None
-        memory.worlds = storage.worlds()
-        memory.append(*storage.rows_of(pending[0]))
+        memory.worlds = pending.worlds
+        memory.append(pending.rows, pending.images)
         nothing = Discard(memory.capacity)
-        storage.apply_turn(*pending, memory, Maintenance(nothing, equalised=False))
+        storage.apply_turn(pending, memory, Maintenance(nothing, equalised=False))
         number += 1
     storage.close()
     return number

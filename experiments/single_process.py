@@ -100,9 +100,14 @@ class SingleProcess:
         config = self.config
         commit, self.counters = numbering.accept(self.counters, config.memory, episode)
         rows, images = sample_rows(
-            self.memory, episode, commit.first_id, commit.commit, commit.episode
+            episode,
+            self.memory.worlds,
+            first_id=commit.first_id,
+            commit=commit.commit,
+            number=commit.episode,
+            stored=commit.stored,
         )
-        self.memory.append(rows[: commit.stored], images[: commit.stored])
+        self.memory.append(rows, images)
         maintenance = maintain(self.memory, commit.episode, config.memory, self.judging)
         if not commit.episode:  # the memory is being filled: not an episode, no training (E9)
             return TurnDone(commit, episode, maintenance, (), False)

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from shared.columns import CHANGES, EPISODE
 from shared.facts import ACTION_COUNT, ACTIONS, IMAGE_BYTES, IMAGE_SHAPE, NAME
 
 PROTOCOL_VERSION = 1
@@ -302,18 +303,7 @@ class Episode(Message):
         n = self.count
         if not 1 <= n <= MAX_EPISODE_SAMPLES:
             raise ValueError(f"an episode has 1..{MAX_EPISODE_SAMPLES} samples, got {n}")
-        for name, width in (
-            ("images", IMAGE_BYTES),
-            ("sample_rewards", 4),
-            ("sample_steps", 4),
-            ("sample_episodes", 4),
-            ("sample_versions", 4),
-            ("sample_worlds", 1),
-            ("positions", 12),
-        ):
-            size = len(getattr(self, name))
-            if size != n * width:
-                raise ValueError(f"{name}: expected {n} x {width} bytes, got {size}")
+        EPISODE.check(self, n)
         if self.bump != (self.ended == "bump"):
             raise ValueError(f"bump is {self.bump}, but the episode ended {self.ended!r}")
         if max(self.sample_actions) > 2:
@@ -480,17 +470,16 @@ class Change(Message):
     def _sizes(self) -> Self:
         if len(self.ids) % 8:
             raise ValueError(f"ids: expected a multiple of 8 bytes, got {len(self.ids)}")
-        n = len(self.ids) // 8
-        widths = {
-            "append": (IMAGE_BYTES, 1, 4),
-            "discard": (0, 0, 0),
-            "rewards": (0, 0, 4),
-        }[self.kind]
-        for name, width in zip(("images", "actions", "rewards"), widths, strict=True):
-            size = len(getattr(self, name))
-            if size != n * width:
-                raise ValueError(f"{self.kind}.{name}: expected {n} x {width} bytes, got {size}")
+        CHANGES[self.kind].check(self, self.count, f"{self.kind}.")
+        for name in CHANGES["append"].names - CHANGES[self.kind].names:
+            if getattr(self, name):
+                raise ValueError(f"{self.kind}.{name}: expected no bytes")
         return self
+
+    @property
+    def count(self) -> int:
+        """Number of samples n."""
+        return len(self.ids) // 8
 
 
 class FeedEnd(Message):

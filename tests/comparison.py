@@ -52,10 +52,7 @@ def single_process(config: Config, episodes: int, changes: Sequence[WorldChange]
 def distributed(config: Config, folder: Path) -> Outcome:
     """Read what the services left in a run folder."""
     storage = Storage(folder / "replay", config.memory, f"{config.run.name}/{config.run.seed}")
-    digests, commit = [], 0
-    while (pending := storage.pending(commit)) is not None:
-        commit = pending[0].commit
-        digests.append((pending[0].episode, str(pending[1]["digest"])))
+    digests = [(int(r["commit"]["episode"]), str(r["digest"])) for r in storage.records()]
     memory, position = storage.load(), storage.position()
     storage.close()
     path = folder / "learner" / "checkpoint.safetensors"

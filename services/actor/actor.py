@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from shared.columns import EPISODE
 from shared.config import Config
 from shared.messages import Action, Episode, Observation, RobotProgress, image_array
 from shared.rl.decision import decide
@@ -269,15 +270,19 @@ def _columns(
 ) -> dict[str, Any]:
     """The per-sample fields of an `Episode`, as bytes."""
     worlds = tuple(dict.fromkeys(step.world for step in steps))
-    places = [(step.x_m, step.y_m, step.heading_rad) for step in steps]
+    images = np.frombuffer(b"".join(step.image for step in steps), np.uint8)
     return {
         "worlds": worlds,
-        "images": b"".join(step.image for step in steps),
-        "sample_actions": bytes(step.action for step in steps),
-        "sample_rewards": rewards.astype("<f4").tobytes(),
-        "sample_steps": np.array([step.number for step in steps], "<u4").tobytes(),
-        "sample_episodes": np.array([step.robot_episode for step in steps], "<u4").tobytes(),
-        "sample_versions": np.array([step.acted_version for step in steps], "<u4").tobytes(),
-        "sample_worlds": bytes(worlds.index(step.world) for step in steps),
-        "positions": np.array(places, "<f4").tobytes(),
+        **EPISODE.encode(
+            {
+                "images": images,
+                "sample_actions": [step.action for step in steps],
+                "sample_rewards": rewards,
+                "sample_steps": [step.number for step in steps],
+                "sample_episodes": [step.robot_episode for step in steps],
+                "sample_versions": [step.acted_version for step in steps],
+                "sample_worlds": [worlds.index(step.world) for step in steps],
+                "positions": [(step.x_m, step.y_m, step.heading_rad) for step in steps],
+            }
+        ),
     }

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-import numpy as np
-
 from shared.bus import Bus
+from shared.changes import apply
 from shared.errors import PeerSilent
-from shared.facts import IMAGE_SHAPE
 from shared.keys import CHANGES, SNAPSHOT
 from shared.messages import Change, ChangesRequest, FeedEnd, SnapshotRequest
-from shared.rl.memory import MIRROR, SampleStore
+from shared.rl.memory import SampleStore
 
 TRANSFER_TIMEOUT_S = 60.0
 
@@ -38,15 +36,11 @@ class Mirror:
             )
             if not end.gone and end.change == number:
                 for part in parts:
-                    self.apply(part)
+                    apply(self.samples, part)
                 self.number = number
                 return
             self.resyncs += 1
         self._snapshot(bus, number)
-
-    def apply(self, part: Change) -> None:
-        """Apply one part. Raises KeyError or ValueError when it does not fit the samples."""
-        apply(self.samples, part)
 
     def _snapshot(self, bus: Bus, number: int) -> None:
         self.samples, self.number = SampleStore(), None
@@ -63,31 +57,15 @@ class Mirror:
                 return
             assert isinstance(part, Change)
             apply(samples, part)
-            rows, messages = rows + len(part.ids) // 8, messages + 1
+            rows, messages = rows + part.count, messages + 1
         raise PeerSilent(f"snapshot broke off after {rows} rows")
-
-
-def apply(samples: SampleStore, part: Change) -> None:
-    """Apply one part of a change to a store of samples."""
-    ids = np.frombuffer(part.ids, "<u8")
-    if part.kind == "discard":
-        samples.remove(ids)
-        return
-    rewards = np.frombuffer(part.rewards, "<f4")
-    if part.kind == "rewards":
-        samples.set_rewards(ids, rewards)
-        return
-    rows = np.zeros(len(ids), MIRROR)
-    rows["id"], rows["reward"] = ids, rewards
-    rows["action"] = np.frombuffer(part.actions, np.uint8)
-    samples.append(rows, np.frombuffer(part.images, np.uint8).reshape(-1, *IMAGE_SHAPE))
 
 
 def _received(replies: Iterable[Change | FeedEnd]) -> tuple[list[Change], FeedEnd]:
     parts: list[Change] = []
     for reply in replies:
         if isinstance(reply, FeedEnd):
-            _check_complete(reply, sum(len(p.ids) // 8 for p in parts), len(parts))
+            _check_complete(reply, sum(p.count for p in parts), len(parts))
             return parts, reply
         parts.append(reply)
     raise PeerSilent(f"changes broke off after {len(parts)} parts")

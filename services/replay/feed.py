@@ -1,97 +1,127 @@
-"""What the learner pulls: numbered changes, snapshots and mini-batches from read transactions."""
+"""The feed: numbered changes as they are written, and what learners pull of the memory."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
-from services.replay.tables import REWARDS, Position, Tables, Txn, key_of, number_of, unpack
+from services.replay.tables import REWARDS, Position, Tables, Txn, key_of, number_of, pack, unpack
+from shared.changes import change
 from shared.messages import Change, FeedEnd
 
 PART_ROWS = 256
 """Rows of one reply: about 1 MB."""
+CHANGES_KEPT = 512
+"""Changes a learner may lag behind before it needs a snapshot."""
+Kind = Literal["append", "discard", "rewards"]
 
 
-class Feed(Tables):
-    """Reading the memory for others, beside the threads that write it."""
+class Feed:
+    """The changes on disk. Reading them disturbs no thread that writes."""
 
-    _listed: tuple[int, list[int]] | None = None
+    def __init__(self, tables: Tables) -> None:
+        self._tables = tables
+        self._listed: tuple[int, list[int]] | None = None
+
+    def note(self, txn: Txn, number: int, kind: Kind, what: Any) -> None:
+        """Write a change.
+
+        what: of an append first insertion number and count, of a discard the insertion numbers as
+        bytes, of rewards the column `REWARDS` as bytes.
+        """
+        txn.put(key_of(number), pack([kind, what]), db=self._tables.db["changes"])
+
+    def forget(self, txn: Txn, position: Position) -> None:
+        """Delete old changes, and with a forgotten discard the samples it removed."""
+        db, most_dead = self._tables.db, max(position.capacity // 2, 1000)
+        with txn.cursor(db["changes"]) as cursor:
+            while cursor.first() and (
+                number_of(cursor.key()) <= position.change - CHANGES_KEPT
+                or txn.stat(db["dead"])["entries"] > most_dead
+            ):
+                kind, what = unpack(cursor.value())
+                if kind == "discard":
+                    for i in np.frombuffer(what, "<u8"):
+                        for table in ("images", "samples", "dead"):
+                            txn.delete(key_of(int(i)), db=db[table])
+                cursor.delete()
 
     def changes(self, since: int, upto: int) -> Iterator[Change | FeedEnd]:
-        """All changes in (since, upto] in parts of about 1 MB, then a `FeedEnd`."""
-        with self._env.begin() as txn:
-            newest = Position(**self._meta(txn, "position")).change
+        """Yield all changes in (since, upto] in parts of about 1 MB, then a `FeedEnd`."""
+        tables = self._tables
+        with tables.env.begin() as txn:
+            newest = tables.position(txn).change
             upto = min(upto, newest)
-            with txn.cursor(self._db["changes"]) as cursor:
+            with txn.cursor(tables.db["changes"]) as cursor:
                 oldest = number_of(cursor.key()) if cursor.first() else newest + 1
             if (since < upto and since + 1 < oldest) or since > newest:
                 yield FeedEnd(change=since, rows=0, messages=0, gone=True)
                 return
             rows = messages = 0
             for number in range(since + 1, upto + 1):
-                kind, what = unpack(txn.get(key_of(number), db=self._db["changes"]))
-                for part in self._parts(txn, number, kind, what):
-                    rows, messages = rows + len(part.ids) // 8, messages + 1
+                for part in self._parts(txn, number):
+                    rows, messages = rows + part.count, messages + 1
                     yield part
             yield FeedEnd(change=max(upto, since), rows=rows, messages=messages)
 
     def snapshot(self) -> Iterator[Change | FeedEnd]:
-        """The whole memory at the newest turn, from one read transaction."""
-        with self._env.begin() as txn:
-            number = Position(**self._meta(txn, "position")).change
-            ids = self._alive(txn)
-            messages = 0
-            for start in range(0, len(ids), PART_ROWS):
-                rows, images = self._rows(txn, ids[start : start + PART_ROWS])
-                self._overlay_rewards(txn, rows)
+        """Yield the whole memory at the newest turn, from one read transaction."""
+        with self._tables.env.begin() as txn:
+            number = self._tables.position(txn).change
+            ids, messages = self._tables.alive(txn), 0
+            for part in self._appended(txn, number, ids, current=True):
                 messages += 1
-                last = start + PART_ROWS >= len(ids)
-                yield _appended(number, last, rows, images)
+                yield part
             yield FeedEnd(change=number, rows=len(ids), messages=messages)
 
     def mini_batch(self, size: int, draw: np.random.Generator) -> Change:
-        """At most `size` samples without replacement, drawn by rank, with current rewards."""
-        with self._env.begin() as txn:
-            number = Position(**self._meta(txn, "position")).change
+        """Return at most `size` samples without replacement, drawn by rank, with their rewards."""
+        with self._tables.env.begin() as txn:
+            number = self._tables.position(txn).change
             alive = self._alive_at(txn, number)
             ranks = draw.choice(len(alive), size=min(size, len(alive)), replace=False)
-            rows, images = self._rows(txn, sorted(alive[rank] for rank in ranks))
-            self._overlay_rewards(txn, rows)
-            return _appended(number, True, rows, images)
+            ids = sorted(alive[rank] for rank in ranks)
+            return self._part(txn, number, ids, last=True, current=True)
 
     def _alive_at(self, txn: Txn, number: int) -> list[int]:
-        """Insertion numbers after this change, kept for as long as nothing changes."""
+        """Return the insertion numbers after this change, kept for as long as nothing changes."""
         if self._listed is None or self._listed[0] != number:
-            self._listed = number, self._alive(txn)
+            self._listed = number, self._tables.alive(txn)
         return self._listed[1]
 
-    def _parts(self, txn: Txn, number: int, kind: str, what: Any) -> Iterator[Change]:
+    def _parts(self, txn: Txn, number: int) -> Iterator[Change]:
+        """Yield the parts of a change that `note` wrote."""
+        kind, what = unpack(txn.get(key_of(number), db=self._tables.db["changes"]))
         if kind == "append":
             first, count = what
-            for start in range(0, count, PART_ROWS):
-                stop = min(start + PART_ROWS, count)
-                rows, images = self._rows(txn, list(range(first + start, first + stop)))
-                yield _appended(number, stop == count, rows, images)
+            yield from self._appended(txn, number, list(range(first, first + count)), current=False)
         elif kind == "discard":
-            yield Change(number=number, last=True, kind="discard", ids=what)
+            yield change(number, True, "discard", ids=np.frombuffer(what, "<u8"))
         else:
             column = np.frombuffer(what, REWARDS)
-            ids, rewards = column["id"].tobytes(), column["reward"].tobytes()
-            yield Change(number=number, last=True, kind="rewards", ids=ids, rewards=rewards)
+            yield change(number, True, "rewards", ids=column["id"], rewards=column["reward"])
 
+    def _appended(
+        self, txn: Txn, number: int, ids: list[int], *, current: bool
+    ) -> Iterator[Change]:
+        for start in range(0, len(ids), PART_ROWS):
+            last = start + PART_ROWS >= len(ids)
+            part = ids[start : start + PART_ROWS]
+            yield self._part(txn, number, part, last=last, current=current)
 
-def _appended(
-    number: int, last: bool, rows: npt.NDArray[np.void], images: npt.NDArray[np.uint8]
-) -> Change:
-    return Change(
-        number=number,
-        last=last,
-        kind="append",
-        ids=rows["id"].astype("<u8").tobytes(),
-        images=images.tobytes(),
-        actions=rows["action"].tobytes(),
-        rewards=rows["reward"].astype("<f4").tobytes(),
-    )
+    def _part(self, txn: Txn, number: int, ids: list[int], *, last: bool, current: bool) -> Change:
+        """Return samples as appended, with current rewards or those they were inserted with."""
+        rows, images = self._tables.rows(txn, ids)
+        if current:
+            self._tables.overlay_rewards(txn, rows)
+        return change(
+            number,
+            last,
+            "append",
+            ids=rows["id"],
+            images=images,
+            actions=rows["action"],
+            rewards=rows["reward"],
+        )

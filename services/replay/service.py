@@ -181,14 +181,14 @@ class Intake:
     def _stream(self, request: Request) -> None:
         message = request.message
         if isinstance(message, ChangesRequest):
-            for part in self._storage.changes(message.since, message.upto):
+            for part in self._storage.feed.changes(message.since, message.upto):
                 request.reply(part)
         elif isinstance(message, SnapshotRequest):
-            for part in self._storage.snapshot():
+            for part in self._storage.feed.snapshot():
                 request.reply(part)
         elif isinstance(message, MiniBatchRequest):
             draw = generator(self._me.config.run.seed, "foreign mini-batch", message.key)
-            request.reply(self._storage.mini_batch(message.size, draw))
+            request.reply(self._storage.feed.mini_batch(message.size, draw))
 
 
 def _totals(counters: Counters) -> dict[str, int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from services.replay.tables import (
     MARKS,
     REWARDS,
     Position,
+    Tables,
     Txn,
     key_of,
     match,
@@ -22,13 +24,11 @@ from services.replay.tables import (
     pack,
     unpack,
 )
+from shared.config import MemoryConfig
 from shared.messages import Episode, Turn
 from shared.rl.memory import ReplayMemory
 from shared.rl.retention.strategy import columns
 from shared.rl.turn import Maintenance, sample_rows
-
-CHANGES_KEPT = 512
-"""Changes a learner may lag behind before it needs a snapshot."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,51 @@ class Accepted:
     duplicate: bool
 
 
-class Storage(Feed):
-    """All access to the files. Writing methods may be called from two threads: LMDB serialises."""
+@dataclass(frozen=True)
+class Submission:
+    """A submission that is on disk, with all that its turn needs."""
+
+    commit: Commit
+    record: dict[str, Any]
+    """The summary of its episode, and totals."""
+    rows: npt.NDArray[np.void]
+    images: npt.NDArray[np.uint8]
+    worlds: list[str]
+    """Names that the rows' column points into."""
+
+
+class Storage:
+    """What is written and loaded. Two threads may write: LMDB lets one after the other do so."""
+
+    def __init__(self, folder: Path, config: MemoryConfig, identity: str) -> None:
+        """Open or create. Raises StateError when the files belong to another run or schema."""
+        self._config = config
+        self._tables = Tables(folder, config, identity)
+        self.feed = Feed(self._tables)
+
+    def close(self) -> None:
+        """Close the files; all other threads must be done with them."""
+        self._tables.env.close()
+
+    def counters(self) -> Counters:
+        """Return the counters as of the newest commit."""
+        with self._tables.env.begin() as txn:
+            return Counters.from_dict(self._tables.meta(txn, "counters"))
+
+    def position(self) -> Position:
+        """Return how far the turns have come."""
+        with self._tables.env.begin() as txn:
+            return self._tables.position(txn)
+
+    def newest_weights_version(self) -> int:
+        """Return the weights version of the newest commit; 0 without one."""
+        with self._tables.env.begin() as txn, txn.cursor(self._tables.db["commits"]) as cursor:
+            return int(unpack(cursor.value())["weights_version"]) if cursor.last() else 0
+
+    def size(self) -> int:
+        """Return the number of samples in memory at the newest turn."""
+        with self._tables.env.begin() as txn:
+            return len(self._tables.alive(txn))
 
     def commit(self, episode: Episode) -> Accepted:
         """Write one submission, or recognise it as already written; on disk when this returns.
@@ -49,11 +92,11 @@ class Storage(Feed):
         Raises ValueError with the reason when it cannot be accepted.
         """
         identity = f"{episode.robot}/{episode.life}/{episode.number}".encode()
-        with self._env.begin(write=True) as txn:
-            counters = Counters.from_dict(self._meta(txn, "counters"))
-            known = txn.get(identity, db=self._db["identity"])
+        with self._tables.env.begin(write=True) as txn:
+            counters = Counters.from_dict(self._tables.meta(txn, "counters"))
+            known = txn.get(identity, db=self._tables.db["identity"])
             if known is not None:
-                record = unpack(txn.get(known, db=self._db["commits"]))
+                record = unpack(txn.get(known, db=self._tables.db["commits"]))
                 return Accepted(Commit(**record["commit"]), counters, duplicate=True)
             reason = numbering.refusal(counters, self._config, episode)
             if reason:
@@ -61,72 +104,70 @@ class Storage(Feed):
             commit, counters = numbering.accept(counters, self._config, episode)
             self._write_samples(txn, episode, commit)
             record = {"commit": asdict(commit), "totals": _totals(counters), **_summary(episode)}
-            txn.put(key_of(commit.commit), pack(record), db=self._db["commits"])
-            txn.put(identity, key_of(commit.commit), db=self._db["identity"])
-            self._put_meta(txn, "counters", counters.to_dict())
+            txn.put(key_of(commit.commit), pack(record), db=self._tables.db["commits"])
+            txn.put(identity, key_of(commit.commit), db=self._tables.db["identity"])
+            self._tables.put_meta(txn, "counters", counters.to_dict())
         return Accepted(commit, counters, duplicate=False)
 
     def _write_samples(self, txn: Txn, episode: Episode, commit: Commit) -> None:
-        memory = ReplayMemory(1)
-        memory.worlds = list(self._meta(txn, "worlds"))
-        rows, images = sample_rows(memory, episode, commit.first_id, commit.commit, commit.episode)
-        self._put_meta(txn, "worlds", memory.worlds)
+        worlds = list(self._tables.meta(txn, "worlds"))
+        rows, images = sample_rows(
+            episode,
+            worlds,
+            first_id=commit.first_id,
+            commit=commit.commit,
+            number=commit.episode,
+            stored=commit.stored,
+        )
+        self._tables.put_meta(txn, "worlds", worlds)
         keys = [key_of(commit.first_id + i) for i in range(commit.stored)]
-        for table, values in (
-            ("images", [image.tobytes() for image in images[: commit.stored]]),
-            ("samples", [row.tobytes() for row in rows[: commit.stored]]),
-        ):
-            with txn.cursor(self._db[table]) as cursor:
-                cursor.putmulti(list(zip(keys, values, strict=True)), append=True)
+        for table, values in (("images", images), ("samples", rows)):
+            with txn.cursor(self._tables.db[table]) as cursor:
+                pairs = zip(keys, (value.tobytes() for value in values), strict=True)
+                cursor.putmulti(list(pairs), append=True)
 
-    def pending(self, after: int) -> tuple[Commit, dict[str, Any]] | None:
-        """The commit after number `after`, with the summary of its episode, if there is one."""
-        with self._env.begin() as txn:
-            data = txn.get(key_of(after + 1), db=self._db["commits"])
-        if data is None:
-            return None
-        record = unpack(data)
-        return Commit(**record["commit"]), record
+    def pending(self, after: int) -> Submission | None:
+        """Return the submission after commit `after`, if there is one."""
+        tables = self._tables
+        with tables.env.begin() as txn:
+            data = txn.get(key_of(after + 1), db=tables.db["commits"])
+            if data is None:
+                return None
+            record = unpack(data)
+            commit = Commit(**record["commit"])
+            ids = range(commit.first_id, commit.first_id + commit.stored)
+            rows, images = tables.rows(txn, list(ids))
+            return Submission(commit, record, rows, images, list(tables.meta(txn, "worlds")))
 
-    def records(self, after: int) -> list[dict[str, Any]]:
-        """Records of all counted episodes beyond global number `after`, in order."""
-        with self._env.begin() as txn:
-            records = [unpack(data) for _, data in txn.cursor(self._db["commits"])]
-        return [r for r in records if r["commit"]["episode"] > after]
-
-    def rows_of(self, commit: Commit) -> tuple[npt.NDArray[np.void], npt.NDArray[np.uint8]]:
-        """The rows and images a commit brought."""
-        ids = range(commit.first_id, commit.first_id + commit.stored)
-        with self._env.begin() as txn:
-            return self._rows(txn, list(ids))
+    def records(self) -> list[dict[str, Any]]:
+        """Return the records of all submissions in order, also of those whose samples are gone."""
+        with self._tables.env.begin() as txn:
+            return [unpack(data) for _, data in txn.cursor(self._tables.db["commits"])]
 
     def apply_turn(
-        self,
-        commit: Commit,
-        summary: dict[str, Any],
-        memory: ReplayMemory,
-        done: Maintenance,
+        self, submission: Submission, memory: ReplayMemory, done: Maintenance
     ) -> Position:
         """Write everything one turn changed, in one transaction, and number the changes."""
-        with self._env.begin(write=True) as txn:
-            position = Position(**self._meta(txn, "position"))
+        commit, summary = submission.commit, submission.record
+        with self._tables.env.begin(write=True) as txn:
+            position = self._tables.position(txn)
             number = position.change
             if commit.stored:
                 number += 1
-                self._put_change(txn, number, "append", [commit.first_id, commit.stored])
+                self.feed.note(txn, number, "append", [commit.first_id, commit.stored])
             removed = done.discarded.ids
             if len(removed):
                 number += 1
-                self._put_change(txn, number, "discard", removed.astype("<u8").tobytes())
-                with txn.cursor(self._db["dead"]) as cursor:
+                self.feed.note(txn, number, "discard", removed.astype("<u8").tobytes())
+                with txn.cursor(self._tables.db["dead"]) as cursor:
                     cursor.putmulti([(key_of(int(i)), key_of(number)) for i in removed])
             if done.equalised:
                 number += 1
                 column = _column(memory, REWARDS)
-                self._put_change(txn, number, "rewards", column)
-                txn.put(b"rewards", column, db=self._db["columns"])
+                self.feed.note(txn, number, "rewards", column)
+                txn.put(b"rewards", column, db=self._tables.db["columns"])
             if done.discarded.marked:
-                txn.put(b"marks", _column(memory, MARKS), db=self._db["columns"])
+                txn.put(b"marks", _column(memory, MARKS), db=self._tables.db["columns"])
             turn, turn_change = position.turn, position.turn_change
             if commit.episode:
                 turn, turn_change = commit.episode, number
@@ -136,18 +177,18 @@ class Storage(Feed):
                     "actions": int(summary["actions"]),
                     "samples": commit.stored,
                 }
-                txn.put(key_of(turn), pack(entry), db=self._db["turns"])
+                txn.put(key_of(turn), pack(entry), db=self._tables.db["turns"])
             position = Position(
                 number, commit.commit, turn, turn_change, memory.capacity, memory.kept
             )
-            self._put_meta(txn, "position", asdict(position))
-            self._forget_changes(txn, position)
+            self._tables.put_meta(txn, "position", asdict(position))
+            self.feed.forget(txn, position)
         return position
 
     def turns(self, since: int, limit: int) -> tuple[Turn, ...]:
         """Turns after episode `since`, in order, without gaps, at most `limit`."""
         found = []
-        with self._env.begin() as txn, txn.cursor(self._db["turns"]) as cursor:
+        with self._tables.env.begin() as txn, txn.cursor(self._tables.db["turns"]) as cursor:
             if cursor.set_range(key_of(since + 1)):
                 for key, data in cursor:
                     found.append(Turn(episode=number_of(key), **unpack(data)))
@@ -157,39 +198,21 @@ class Storage(Feed):
 
     def load(self) -> ReplayMemory:
         """The memory as of the newest applied turn."""
-        with self._env.begin() as txn:
-            position = Position(**self._meta(txn, "position"))
+        with self._tables.env.begin() as txn:
+            position = self._tables.position(txn)
             memory = ReplayMemory(position.capacity)
             memory.kept = position.kept
-            memory.worlds = list(self._meta(txn, "worlds"))
-            ids = self._alive(txn)
+            memory.worlds = list(self._tables.meta(txn, "worlds"))
+            ids = self._tables.alive(txn)
             for start in range(0, len(ids), PART_ROWS):
-                rows, images = self._rows(txn, ids[start : start + PART_ROWS])
+                rows, images = self._tables.rows(txn, ids[start : start + PART_ROWS])
                 memory.append(rows, images)
-            self._overlay_rewards(txn, memory.rows)
-            marks = self._stored_column(txn, "marks", MARKS)
+            self._tables.overlay_rewards(txn, memory.rows)
+            marks = self._tables.column(txn, "marks", MARKS)
         known, where = match(memory.ids, marks["id"])
         for name, *_ in columns():
             memory.rows[name][known] = marks[name][where]
         return memory
-
-    def _put_change(self, txn: Txn, number: int, kind: str, what: Any) -> None:
-        txn.put(key_of(number), pack([kind, what]), db=self._db["changes"])
-
-    def _forget_changes(self, txn: Txn, position: Position) -> None:
-        """Delete old changes, and with a forgotten discard the samples it removed."""
-        most_dead = max(position.capacity // 2, 1000)
-        with txn.cursor(self._db["changes"]) as cursor:
-            while cursor.first() and (
-                number_of(cursor.key()) <= position.change - CHANGES_KEPT
-                or txn.stat(self._db["dead"])["entries"] > most_dead
-            ):
-                kind, what = unpack(cursor.value())
-                if kind == "discard":
-                    for i in np.frombuffer(what, "<u8"):
-                        for table in ("images", "samples", "dead"):
-                            txn.delete(key_of(int(i)), db=self._db[table])
-                cursor.delete()
 
 
 def _column(memory: ReplayMemory, dtype: np.dtype[np.void]) -> bytes:

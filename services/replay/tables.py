@@ -84,23 +84,22 @@ class Position:
 
 
 class Tables:
-    """The open files, and what reading and writing share."""
+    """The open files, and what reading and writing within a transaction share."""
 
     def __init__(self, folder: Path, config: MemoryConfig, identity: str) -> None:
         """Open or create. Raises StateError when the files belong to another run or schema."""
         folder.mkdir(parents=True, exist_ok=True)
-        self._config = config
-        self._env = lmdb.open(str(folder), map_size=MAP_BYTES, max_dbs=len(TABLES), max_readers=64)
+        self.env = lmdb.open(str(folder), map_size=MAP_BYTES, max_dbs=len(TABLES), max_readers=64)
         self._mapping = Mapping(folder / "data.mdb")
-        self._db = {name: self._env.open_db(name.encode()) for name in TABLES}
-        with self._env.begin(write=True) as txn:
-            known = self._meta(txn, "identity")
+        self.db = {name: self.env.open_db(name.encode()) for name in TABLES}
+        with self.env.begin(write=True) as txn:
+            known = self.meta(txn, "identity")
             if known is None:
-                self._put_meta(txn, "identity", [SCHEMA, identity])
-                self._put_meta(txn, "counters", Counters().to_dict())
+                self.put_meta(txn, "identity", [SCHEMA, identity])
+                self.put_meta(txn, "counters", Counters().to_dict())
                 start = Position(0, 0, 0, 0, config.capacity)
-                self._put_meta(txn, "position", asdict(start))
-                self._put_meta(txn, "worlds", [])
+                self.put_meta(txn, "position", asdict(start))
+                self.put_meta(txn, "worlds", [])
             elif list(known) != [SCHEMA, identity]:
                 raise StateError(
                     f"{folder}: expected a replay memory of schema and run {[SCHEMA, identity]}, "
@@ -109,59 +108,41 @@ class Tables:
 
     def close(self) -> None:
         """Close the files; all other threads must be done with them."""
-        self._env.close()
+        self.env.close()
 
-    def counters(self) -> Counters:
-        """The counters as of the newest commit."""
-        with self._env.begin() as txn:
-            return Counters.from_dict(self._meta(txn, "counters"))
+    def position(self, txn: Txn) -> Position:
+        """Return how far the turns have come."""
+        return Position(**self.meta(txn, "position"))
 
-    def position(self) -> Position:
-        """How far the turns have come."""
-        with self._env.begin() as txn:
-            return Position(**self._meta(txn, "position"))
-
-    def worlds(self) -> list[str]:
-        """Names that the samples' world indices point into."""
-        with self._env.begin() as txn:
-            return list(self._meta(txn, "worlds"))
-
-    def newest_weights_version(self) -> int:
-        """Weights version of the newest commit; 0 without one."""
-        with self._env.begin() as txn, txn.cursor(self._db["commits"]) as cursor:
-            return int(unpack(cursor.value())["weights_version"]) if cursor.last() else 0
-
-    def size(self) -> int:
-        """Samples in memory at the newest turn."""
-        with self._env.begin() as txn:
-            return len(self._alive(txn))
-
-    def _meta(self, txn: Txn, name: str) -> Any:
-        data = txn.get(name.encode(), db=self._db["meta"])
+    def meta(self, txn: Txn, name: str) -> Any:
+        """Return one of the values in `meta`; None if it is not there."""
+        data = txn.get(name.encode(), db=self.db["meta"])
         return None if data is None else unpack(data)
 
-    def _put_meta(self, txn: Txn, name: str, value: Any) -> None:
-        txn.put(name.encode(), pack(value), db=self._db["meta"])
+    def put_meta(self, txn: Txn, name: str, value: Any) -> None:
+        """Write one of the values in `meta`."""
+        txn.put(name.encode(), pack(value), db=self.db["meta"])
 
-    def _alive(self, txn: Txn) -> list[int]:
-        """Insertion numbers of all samples whose append is applied and whose discard is not."""
-        processed = Position(**self._meta(txn, "position")).processed
-        data = txn.get(key_of(processed), db=self._db["commits"])
+    def alive(self, txn: Txn) -> list[int]:
+        """Return the insertion numbers of all samples in memory at the newest turn."""
+        processed = self.position(txn).processed
+        data = txn.get(key_of(processed), db=self.db["commits"])
         if data is None:
             return []
         commit = Commit(**unpack(data)["commit"])
         end = commit.first_id + commit.stored
-        with txn.cursor(self._db["dead"]) as cursor:
+        with txn.cursor(self.db["dead"]) as cursor:
             dead = {number_of(key) for key in cursor.iternext(values=False)}
-        with txn.cursor(self._db["samples"]) as cursor:
+        with txn.cursor(self.db["samples"]) as cursor:
             ids = [number_of(key) for key in cursor.iternext(values=False)]
         return [i for i in ids if i < end and i not in dead]
 
-    def _rows(self, txn: Txn, ids: list[int]) -> tuple[npt.NDArray[np.void], npt.NDArray[np.uint8]]:
+    def rows(self, txn: Txn, ids: list[int]) -> tuple[npt.NDArray[np.void], npt.NDArray[np.uint8]]:
+        """Return rows, rewards as inserted, and images. Raises StateError if one is missing."""
         keys = [key_of(i) for i in ids]
         parts: dict[str, bytes] = {}
         for table in ("samples", "images"):
-            with txn.cursor(self._db[table]) as cursor:
+            with txn.cursor(self.db[table]) as cursor:
                 found = cursor.getmulti(keys)
             if len(found) != len(keys):
                 raise StateError(f"replay {table}: {len(keys) - len(found)} of {len(keys)} missing")
@@ -171,12 +152,13 @@ class Tables:
         images = np.frombuffer(parts["images"], np.uint8).reshape(len(ids), *IMAGE_SHAPE)
         return rows, images
 
-    def _stored_column(self, txn: Txn, name: str, dtype: np.dtype[np.void]) -> npt.NDArray[np.void]:
-        return np.frombuffer(txn.get(name.encode(), db=self._db["columns"]) or b"", dtype)
+    def column(self, txn: Txn, name: str, dtype: np.dtype[np.void]) -> npt.NDArray[np.void]:
+        """Return a whole column; empty while there is none."""
+        return np.frombuffer(txn.get(name.encode(), db=self.db["columns"]) or b"", dtype)
 
-    def _overlay_rewards(self, txn: Txn, rows: npt.NDArray[np.void]) -> None:
+    def overlay_rewards(self, txn: Txn, rows: npt.NDArray[np.void]) -> None:
         """Replace rewards as inserted by those of the newest equalisation."""
-        column = self._stored_column(txn, "rewards", REWARDS)
+        column = self.column(txn, "rewards", REWARDS)
         known, where = match(rows["id"], column["id"])
         rows["reward"][known] = column["reward"][where]
 

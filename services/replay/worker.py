@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from services.replay.numbering import Commit
-from services.replay.storage import Storage
+from services.replay.storage import Storage, Submission
 from services.replay.tables import Position
 from shared.facts import ACTION_COUNT
 from shared.metrics import MetricsLog
@@ -89,7 +89,7 @@ class TurnWorker(threading.Thread):
                     self._wake.wait(TICK_S)
                     self._wake.clear()
                     continue
-                self._turn(memory, *pending)
+                self._turn(memory, pending)
         except BaseException as error:  # noqa: BLE001  (raised again by the intake thread)
             self.failure = error
             self._me.stop.set(f"the turn worker ended: {error!r}")
@@ -103,15 +103,15 @@ class TurnWorker(threading.Thread):
         self._show(memory, activity="idle")
         return memory
 
-    def _turn(self, memory: ReplayMemory, commit: Commit, record: dict[str, Any]) -> None:
-        """Everything replay does about one submission (E25)."""
+    def _turn(self, memory: ReplayMemory, submission: Submission) -> None:
+        """Do everything that replay does about one submission (E25)."""
+        commit, record = submission.commit, submission.record
         if commit.episode:
             self._show(memory, activity="waiting")
             self._await_weights(int(record["weights_version"]))
         self._show(memory, activity="discarding")
-        rows, images = self._storage.rows_of(commit)
-        memory.worlds = self._storage.worlds()
-        memory.append(rows, images)
+        memory.worlds = submission.worlds
+        memory.append(submission.rows, submission.images)
         done = maintain(
             memory,
             commit.episode,
@@ -123,7 +123,7 @@ class TurnWorker(threading.Thread):
         if commit.episode:  # written first: a row without its turn is dropped at the next start
             self._recent.append(int(record["fitness"]))
             self._metrics.write(self._row(commit, record, memory, done))
-        position = self._storage.apply_turn(commit, record, memory, done)
+        position = self._storage.apply_turn(submission, memory, done)
         if done.discarded.warning:
             self._me.log.warning("episode %d: %s", commit.episode, done.discarded.warning)
         self._show(memory, position=position, activity="idle")
@@ -191,10 +191,12 @@ class TurnWorker(threading.Thread):
         processed = self.view.position.processed
         written = {int(row["episode"]): row for row in self._metrics.kept(2**62)}
         rows: list[dict[str, int | float | str]] = []
-        for record in self._storage.records(0):
+        for record in self._storage.records():
             commit = Commit(**record["commit"])
             if commit.commit > processed:
                 break
+            if not commit.episode:
+                continue
             self._recent.append(int(record["fitness"]))
             rows.append({**written.get(commit.episode, {}), **self._basic_row(commit, record)})
         self._metrics.restart(rows)

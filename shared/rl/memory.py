@@ -183,10 +183,7 @@ class ReplayMemory(SampleStore):
 
     def world_indices(self, names: Sequence[str]) -> npt.NDArray[np.uint16]:
         """Return the indices of world names in `worlds`, which grows as needed."""
-        for name in names:
-            if name not in self.worlds:
-                self.worlds.append(name)
-        return np.array([self.worlds.index(name) for name in names], np.uint16)
+        return world_indices(self.worlds, names)
 
     def check_valid(self) -> None:
         """Raise AssertionError naming the first invariant that does not hold."""
@@ -195,6 +192,14 @@ class ReplayMemory(SampleStore):
         _check([(worlds, "worlds are known")])
         for name in STRATEGIES:
             _check(strategy(name).invariants(self.rows))
+
+
+def world_indices(worlds: list[str], names: Sequence[str]) -> npt.NDArray[np.uint16]:
+    """Return the indices of `names` in `worlds`, which grows as needed."""
+    for name in names:
+        if name not in worlds:
+            worlds.append(name)
+    return np.array([worlds.index(name) for name in names], np.uint16)
 
 
 def _check(invariants: Iterable[tuple[bool, str]]) -> None:

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from shared.facts import IMAGE_SHAPE
+from shared.columns import EPISODE
 from shared.rl.engine import Progress
 from shared.rl.equalisation import due, equalised
-from shared.rl.memory import SAMPLE, Images, ReplayMemory
+from shared.rl.memory import SAMPLE, Images, ReplayMemory, world_indices
 from shared.rl.predictor import Predictor
 from shared.rl.retention.strategy import Discard, Situation, beyond, discard
 
@@ -33,27 +33,24 @@ class Maintenance:
 
 
 def sample_rows(
-    memory: ReplayMemory, episode: Episode, first_id: int, commit: int, number: int
+    episode: Episode, worlds: list[str], *, first_id: int, commit: int, number: int, stored: int
 ) -> tuple[np.ndarray, Images]:
-    """An episode's samples as rows and images for `ReplayMemory.append`.
+    """Return the first `stored` samples of an episode as rows and images for a `ReplayMemory`.
 
-    first_id: insertion number of the first sample; commit: number of the submission; number: the
-    global episode number e, 0 while the memory is filled.
+    worlds: names that the rows' column points into; it grows as needed. first_id: insertion number
+    of the first sample; commit: number of the submission; number: the global episode number e, 0
+    while the memory is filled.
     """
-    n = episode.count
-    rows = np.zeros(n, SAMPLE)
-    rows["id"] = np.arange(first_id, first_id + n)
-    rows["action"] = np.frombuffer(episode.sample_actions, np.uint8)
-    rows["reward"] = np.frombuffer(episode.sample_rewards, "<f4")
+    values = EPISODE.decode(episode)
+    rows = np.zeros(episode.count, SAMPLE)
+    rows["id"] = np.arange(first_id, first_id + episode.count)
+    rows["action"], rows["reward"] = values["sample_actions"], values["sample_rewards"]
     rows["commit"], rows["episode"] = commit, number
-    rows["robot_episode"] = np.frombuffer(episode.sample_episodes, "<u4")
-    rows["step"] = np.frombuffer(episode.sample_steps, "<u4")
-    rows["version"] = np.frombuffer(episode.sample_versions, "<u4")
-    worlds = memory.world_indices(episode.worlds)
-    rows["world"] = worlds[np.frombuffer(episode.sample_worlds, np.uint8)]
-    places = np.frombuffer(episode.positions, "<f4").reshape(n, 3)
-    rows["x_m"], rows["y_m"], rows["heading_rad"] = places.T
-    return rows, np.frombuffer(episode.images, np.uint8).reshape(n, *IMAGE_SHAPE)
+    rows["robot_episode"], rows["step"] = values["sample_episodes"], values["sample_steps"]
+    rows["version"] = values["sample_versions"]
+    rows["world"] = world_indices(worlds, episode.worlds)[values["sample_worlds"]]
+    rows["x_m"], rows["y_m"], rows["heading_rad"] = values["positions"].T
+    return rows[:stored], values["images"][:stored]
 
 
 def maintain(

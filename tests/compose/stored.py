@@ -3,7 +3,6 @@
 import json
 import sys
 from pathlib import Path
-from typing import Any
 
 from services.replay.storage import Storage
 from shared.settings import read_folder
@@ -11,9 +10,7 @@ from shared.settings import read_folder
 folder = Path(sys.argv[1])
 config = read_folder(folder)
 storage = Storage(folder / "replay", config.memory, f"{config.run.name}/{config.run.seed}")
-records: list[dict[str, Any]] = []
-while (pending := storage.pending(len(records))) is not None:
-    records.append(pending[1])
+records = storage.records()
 memory = storage.load()
 memory.check_valid()
 counters = storage.counters()

@@ -20,9 +20,7 @@ REALTIME = {"timing": "realtime", "period_s": 0.1, "deadman_s": 0.2}
 def read_records(cluster: Cluster) -> list[dict[str, object]]:
     config = cluster.config
     storage = Storage(cluster.folder / "replay", config.memory, f"{config.run.name}/7")
-    records = []
-    while (pending := storage.pending(len(records))) is not None:
-        records.append(pending[1])
+    records: list[dict[str, object]] = storage.records()
     storage.load().check_valid()
     storage.close()
     return records

@@ -37,10 +37,7 @@ def test_killed_mid_episode_loses_only_the_open_episode(victim: str, tmp_path: P
         cluster.stop_all()
 
     storage = Storage(tmp_path / "run" / "replay", config.memory, f"{config.run.name}/7")
-    counters = storage.counters()
-    records = []
-    while (pending := storage.pending(len(records))) is not None:
-        records.append(pending[1])
+    counters, records = storage.counters(), storage.records()
     memory = storage.load()
     storage.close()
     memory.check_valid()

@@ -44,9 +44,10 @@ def held_kb(path: Path) -> int:
 def stored_and_read(folder: Path) -> tuple[Storage, int]:
     """A storage whose 300 samples (1.2 MB) have all been read; the part of the file held now."""
     storage = Storage(folder, MemoryConfig(capacity=300), "run1/1")
-    accepted = storage.commit(make_episode(300, fill=True))
-    rows, images = storage.rows_of(accepted.commit)
-    assert len(rows) == len(images) == 300
+    storage.commit(make_episode(300, fill=True))
+    pending = storage.pending(0)
+    assert pending is not None
+    assert len(pending.rows) == len(pending.images) == 300
     return storage, held_kb((folder / "data.mdb").resolve())
 
 

@@ -15,9 +15,10 @@ from builders import FakePredictor, fake_values, make_episode
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.learner.mirror import Mirror, apply
-from services.replay import storage as storage_module
+from services.learner.mirror import Mirror
+from services.replay import feed as feed_module
 from services.replay.storage import Storage
+from shared.changes import apply
 from shared.config import MemoryConfig
 from shared.errors import PeerSilent, StateError
 from shared.keys import CHANGES
@@ -82,12 +83,11 @@ class Bench:
         pending = self.storage.pending(self.storage.position().processed)
         if pending is None:
             return False
-        commit, record = pending
-        rows, images = self.storage.rows_of(commit)
+        commit, rows, images = pending.commit, pending.rows, pending.images
         self.memory.append(rows, images)
         predictor: Any = FakePredictor(self.version)
         done = maintain(self.memory, commit.episode, self.config, predictor)
-        position = self.storage.apply_turn(commit, record, self.memory, done)
+        position = self.storage.apply_turn(pending, self.memory, done)
         self._model_turn(rows, images, commit.episode)
         assert (position.change, position.kept["threshold_percent"]) == (self.change, self.percent)
         assert position.capacity == self.capacity
@@ -237,7 +237,7 @@ def test_disk_memory_and_mirror_hold_what_the_rules_say_over_restarts(
             elif event == "new weights":
                 b.version += 1
             elif event == "mirror":
-                parts, end = pulled(b.storage.changes(at, b.change))
+                parts, end = pulled(b.storage.feed.changes(at, b.change))
                 assert (end.change, end.gone) == (b.change, False)
                 for part in parts:
                     apply(mirror, part)
@@ -268,7 +268,7 @@ def test_disk_memory_and_mirror_hold_what_the_rules_say_over_restarts(
                 b.check()
         b.reopen()
         b.check()
-        parts, end = pulled(b.storage.snapshot())
+        parts, end = pulled(b.storage.feed.snapshot())
         snapshot = SampleStore()
         for part in parts:
             apply(snapshot, part)
@@ -336,7 +336,7 @@ def test_a_turn_that_was_begun_but_not_applied_leaves_nothing_behind() -> None:
         pending = b.storage.pending(0)
         assert pending is not None
         memory = b.storage.load()
-        memory.append(*b.storage.rows_of(pending[0]))
+        memory.append(pending.rows, pending.images)
         predictor: Any = FakePredictor(1)
         maintain(memory, 1, b.config, predictor)
         b.reopen()  # killed here
@@ -414,8 +414,8 @@ def test_records_and_turns_list_counted_episodes_in_order() -> None:
             b.commit(make_episode(seed, seed=seed, images=some_images(seed, seed), ended=ended))
         while b.turn():
             pass
-        assert [r["commit"]["episode"] for r in b.storage.records(0)] == [1, 2, 3, 4, 5]
-        assert [r["fitness"] for r in b.storage.records(3)] == [4, 5]
+        assert [r["commit"]["episode"] for r in b.storage.records()] == [0, 1, 2, 3, 4, 5]
+        assert [r["fitness"] for r in b.storage.records()] == [30, 1, 2, 3, 4, 5]
         turns = b.storage.turns(0, 100)
         assert [(t.episode, t.bump, t.samples, t.actions) for t in turns] == [
             (n, bool(n % 2), n, n) for n in range(1, 6)
@@ -450,8 +450,8 @@ def test_a_missing_image_is_told_and_not_made_up() -> None:
     with bench() as b:
         b.commit(make_episode(3))
         b.turn()
-        with b.storage._env.begin(write=True) as txn:
-            txn.delete((2).to_bytes(8, "big"), db=b.storage._db["images"])
+        with b.storage._tables.env.begin(write=True) as txn:
+            txn.delete((2).to_bytes(8, "big"), db=b.storage._tables.db["images"])
         with pytest.raises(StateError, match="1 of 3 missing"):
             b.storage.load()
 
@@ -463,23 +463,23 @@ def test_a_large_episode_comes_in_parts_of_one_change() -> None:
     with bench(capacity=2000) as b:
         b.commit(make_episode(600, seed=1, images=some_images(600, 1)))
         b.turn()
-        parts, _ = pulled(b.storage.changes(0, 1))
+        parts, _ = pulled(b.storage.feed.changes(0, 1))
         assert [len(p.ids) // 8 for p in parts] == [256, 256, 88]
         assert [p.last for p in parts] == [False, False, True]
         assert {p.number for p in parts} == {1}
-        snapshot, _ = pulled(b.storage.snapshot())
+        snapshot, _ = pulled(b.storage.feed.snapshot())
         assert [p.last for p in snapshot] == [False, False, True]
 
 
 def test_nothing_new_and_nothing_at_all() -> None:
     with bench() as b:
-        parts, end = pulled(b.storage.changes(0, 0))
+        parts, end = pulled(b.storage.feed.changes(0, 0))
         assert (parts, end.change, end.gone) == ([], 0, False)
-        parts, end = pulled(b.storage.snapshot())
+        parts, end = pulled(b.storage.feed.snapshot())
         assert (parts, end.change) == ([], 0)
         b.commit(make_episode(3))
         b.turn()
-        parts, end = pulled(b.storage.changes(1, 1))
+        parts, end = pulled(b.storage.feed.changes(1, 1))
         assert (parts, end.change, end.gone) == ([], 1, False)
 
 
@@ -487,15 +487,15 @@ def test_asking_beyond_the_newest_change_gives_the_newest() -> None:
     with bench() as b:
         b.commit(make_episode(3))
         b.turn()
-        parts, end = pulled(b.storage.changes(0, 99))
+        parts, end = pulled(b.storage.feed.changes(0, 99))
         assert (len(parts), end.change) == (1, 1)
-        assert pulled(b.storage.changes(5, 9))[1].gone  # a mirror of another life of this run
+        assert pulled(b.storage.feed.changes(5, 9))[1].gone  # a mirror of another life of this run
 
 
 def test_forgotten_changes_are_gone_and_their_samples_deleted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(storage_module, "CHANGES_KEPT", 6)
+    monkeypatch.setattr(feed_module, "CHANGES_KEPT", 6)
     with bench(strategy="normm", equalise_every=0) as b:
         for seed in range(12):
             b.commit(make_episode(16, seed=seed, images=some_images(16, seed)))
@@ -503,7 +503,7 @@ def test_forgotten_changes_are_gone_and_their_samples_deleted(
             b.check()
         newest = b.change
         for since in range(newest + 1):
-            parts, end = pulled(b.storage.changes(since, newest))
+            parts, end = pulled(b.storage.feed.changes(since, newest))
             assert end.gone == (since < newest - 6)
             if not end.gone:
                 mirror = SampleStore()
@@ -511,10 +511,10 @@ def test_forgotten_changes_are_gone_and_their_samples_deleted(
                 for part in parts:
                     apply(mirror, part)
                 same_samples(mirror, b.seen[newest])
-        with b.storage._env.begin() as txn:
-            held = txn.stat(b.storage._db["images"])["entries"]
-            assert held == txn.stat(b.storage._db["samples"])["entries"]
-            assert held == len(b.memory) + txn.stat(b.storage._db["dead"])["entries"]
+        with b.storage._tables.env.begin() as txn:
+            held = txn.stat(b.storage._tables.db["images"])["entries"]
+            assert held == txn.stat(b.storage._tables.db["samples"])["entries"]
+            assert held == len(b.memory) + txn.stat(b.storage._tables.db["dead"])["entries"]
         assert held < 12 * 16
         b.reopen()
         b.check()
@@ -533,17 +533,19 @@ def test_a_mini_batch_for_a_foreign_learner_has_current_rewards() -> None:
         for seed in range(3):
             b.commit(make_episode(20, seed=seed, images=some_images(20, seed)))
             b.turn()
-        batch = b.storage.mini_batch(8, generator(1, "test", 1))
-        assert batch == b.storage.mini_batch(8, generator(1, "test", 1))
+        batch = b.storage.feed.mini_batch(8, generator(1, "test", 1))
+        assert batch == b.storage.feed.mini_batch(8, generator(1, "test", 1))
         ids = np.frombuffer(batch.ids, "<u8").tolist()
         assert len(ids) == len(set(ids)) == 8
         ranks = b.memory.ranks(np.array(ids, np.uint64))
         assert batch.rewards == b.memory.rows["reward"][ranks].tobytes()
         assert batch.images == b.memory.images(ranks).tobytes()
-        assert len(b.storage.mini_batch(999, generator(1, "test", 2)).ids) // 8 == len(b.memory)
+        assert len(b.storage.feed.mini_batch(999, generator(1, "test", 2)).ids) // 8 == len(
+            b.memory
+        )
         b.commit(make_episode(20, seed=3, images=some_images(20, 3)))
         b.turn()
-        later = b.storage.mini_batch(999, generator(1, "test", 2))
+        later = b.storage.feed.mini_batch(999, generator(1, "test", 2))
         assert np.frombuffer(later.ids, "<u8").tolist() == b.memory.ids.tolist()
 
 
@@ -562,16 +564,16 @@ class ScriptedBus:
         self.asked.append(stream.name)
         storage = self.bench.storage
         if stream is CHANGES:
-            replies = list(storage.changes(request.since, request.upto))
+            replies = list(storage.feed.changes(request.since, request.upto))
         else:
-            replies = list(storage.snapshot())
+            replies = list(storage.feed.snapshot())
         yield from replies[:-1] if self.break_off else replies
 
 
 def test_a_mirror_follows_change_by_change_and_resynchronises_after_a_gap(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(storage_module, "CHANGES_KEPT", 4)
+    monkeypatch.setattr(feed_module, "CHANGES_KEPT", 4)
     with bench() as b:
         mirror, bus = Mirror(), ScriptedBus(b)
         any_bus: Any = bus

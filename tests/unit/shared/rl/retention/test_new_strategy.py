@@ -50,9 +50,9 @@ for number in (1, 2, 3):
     memory = storage.load()
     storage.commit(make_episode(20, seed=number))
     pending = storage.pending(number - 1)
-    memory.append(*storage.rows_of(pending[0]))
+    memory.append(pending.rows, pending.images)
     done = maintain(memory, number, config, FakePredictor())
-    storage.apply_turn(*pending, memory, done)
+    storage.apply_turn(pending, memory, done)
     assert done.discarded.told["threshold_percent"] == 1, done
     told.append(done.discarded.told["discards"])
     loaded = storage.load()
