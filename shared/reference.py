@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import sys
+import textwrap
 import types
 import typing
 from collections.abc import Iterator
@@ -29,7 +30,7 @@ def streams_table() -> str:
     lines = [
         "| stream | key | payload -> answer | from -> to | delivery | rate | at most | queue "
         "| overflow |",
-        "|---|---|---|---|---|---|---|---|---|",
+        _rule(9),
     ]
     for s in STREAMS:
         answers = " / ".join(reply.__name__ for reply in s.reply)
@@ -65,10 +66,10 @@ def configuration_tables() -> str:
         lines = [
             f"### `{name}`",
             "",
-            _text(section.__doc__),
+            _paragraph(section.__doc__),
             "",
             "| key | type | default | meaning |",
-            "|---|---|---|---|",
+            _rule(4),
         ]
         for key, field in section.model_fields.items():
             if not _is_section(field):
@@ -99,8 +100,8 @@ def main(paths: list[str]) -> None:
 
 
 def _message_table(cls: type[messages.Message]) -> str:
-    head = ["| field | type | meaning |", "|---|---|---|"]
-    lines = [f"### {cls.__name__}", "", _text(cls.__doc__), "", *head]
+    head = ["| field | type | meaning |", _rule(3)]
+    lines = [f"### {cls.__name__}", "", _paragraph(cls.__doc__), "", *head]
     for name, field in cls.model_fields.items():
         optional = "" if field.is_required() else f", default `{field.default!r}`"
         lines.append(f"| `{name}` | {_type(field)}{optional} | {_text(field.description)} |")
@@ -141,7 +142,7 @@ def _type(field: FieldInfo) -> str:
     least, most = limits.pop("min_length", None), limits.pop("max_length", None)
     if least is not None or most is not None:
         words.append(f"length {least}" if least == most else f"length {least or 0}..{most or ''}")
-    signs = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
+    signs = {"ge": ">=", "gt": ">", "le": "\\<=", "lt": "<"}
     words += [f"{signs[name]} {_number(value)}" for name, value in limits.items()]
     return ", ".join(words).replace("|", "\\|")
 
@@ -171,8 +172,24 @@ def _size(count: int) -> str:
     return f"{count // 2**20} MiB" if count >= 2**20 else f"{count // 1024} KiB"
 
 
+def _rule(columns: int) -> str:
+    """Return the line between the head and the body of a table, as the formatter writes it."""
+    return "| " + "-- | " * (columns - 1) + "-- |"
+
+
 def _text(doc: str | None) -> str:
-    return " ".join((doc or "").split()).replace("|", "\\|")
+    """Return a docstring as one line of Markdown; what stands between backticks stays as it is."""
+    parts = " ".join((doc or "").split()).replace("|", "\\|").split("`")
+    parts[::2] = [
+        re.sub(r"\[([^]]*)\]:", r"\\[\1\\]:", re.sub(r"<(?=\S)", r"\\<", part))
+        for part in parts[::2]
+    ]
+    return "`".join(parts)
+
+
+def _paragraph(doc: str | None) -> str:
+    """Return a docstring as a paragraph of Markdown, wrapped as the formatter wraps it."""
+    return textwrap.fill(_text(doc), 100, break_long_words=False, break_on_hyphens=False)
 
 
 if __name__ == "__main__":

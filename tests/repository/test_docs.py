@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import re
 import tomllib
@@ -111,7 +112,7 @@ def test_settings_named_exist(page: Path) -> None:
 
 def test_every_metrics_column_is_explained_in_order() -> None:
     cells = [cell.strip("`") for cell in first_cells(section("operations.md", "Metrics"))]
-    assert [cell for cell in cells if cell not in ("column", "---")] == [
+    assert [cell for cell in cells if cell not in ("column", "--")] == [
         *EPISODES.split(),
         *TRAINING.split(),
     ]
@@ -128,10 +129,27 @@ def test_every_counter_is_a_field_of_the_heartbeat() -> None:
                 assert counter in state.model_fields, (service, counter)
 
 
+def test_messages_quoted_for_troubleshooting_occur_in_the_code() -> None:
+    written = {
+        node.value
+        for top in ("shared", "services", "experiments")
+        for path in (ROOT / top).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+    quoted = re.findall(r"^\| `([^`]+)`", section("operations.md", "Troubleshooting"), re.M)
+    assert len(quoted) > 8
+    for message in quoted:
+        # Dots, capitals and names in quotes stand for what differs from case to case.
+        for part in re.split(r"\.\.\.|'\w+'|\b[A-Z]{2,}\b", message):
+            words = part.strip(" :,")
+            assert any(words in text.replace("`", "") for text in written), (message, words)
+
+
 def test_every_erratum_has_our_reading() -> None:
     listed = first_cells(section("algorithm.md", "Open questions and our readings"))
-    ids = [*(f"E{n}" for n in range(1, 18)), "E17b", *(f"E{n}" for n in range(18, 36)), "E38"]
-    assert listed == ["id", *ids]
+    ids = [*(f"E{n}" for n in range(1, 18)), "E17b", *(f"E{n}" for n in range(18, 47))]
+    assert listed == ["id", "--", *ids]
 
 
 def test_every_requirement_of_the_algorithm_has_its_place() -> None:
@@ -183,7 +201,7 @@ def test_every_library_has_its_reason() -> None:
     explained: set[str] = set()
     for cell in first_cells((DOCS / "dependencies.md").read_text()):
         explained |= set(cell.split(", "))
-    assert explained - {"library", "---"} == names
+    assert explained - {"library", "--"} == names
 
 
 def test_pictures_are_small() -> None:
