@@ -30,11 +30,11 @@ from experiments.drives.choosers import Chooser, greedy, uniform
 from experiments.drives.frozen_drives import evaluate
 from experiments.drives.traces import Figures
 from experiments.environment import CorridorEnv
-from experiments.runs.provenance import commit
 from experiments.single_process import SingleProcess
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import load_world
 from shared.config import Config
+from shared.provenance import commit
 
 LONG = True
 """Too long for short measuring: the stored results stay as they are then."""

@@ -18,8 +18,8 @@ import numpy.typing as npt
 
 from benchmarks import frames
 from benchmarks.frame import Bar, Mode, interleaved, mode_of, report, rounds_of, table
-from experiments.runs.provenance import ROOT
 from shared.config import MemoryConfig, Numerics
+from shared.provenance import ROOT
 from shared.rl.memory import SAMPLE, ReplayMemory
 from shared.rl.predictor import Predictor
 from shared.rl.retention.strategy import Situation, discard

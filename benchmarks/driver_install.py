@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 
-from experiments.runs.provenance import ROOT, machine
+from shared.provenance import ROOT, machine
 
 FOREIGN = ("torch", "pybullet", "cv2", "gymnasium", "matplotlib", "openvino")
 NOWHERE = {

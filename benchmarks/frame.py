@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, field
 from statistics import median
 from typing import Any, Literal
 
-from experiments.runs.provenance import machine
+from shared.provenance import machine
 
 Mode = Literal["check", "short", "full"]
 Better = Literal["higher", "lower"]

@@ -21,8 +21,8 @@ from types import SimpleNamespace
 import numpy as np
 
 from benchmarks.frame import Bar, Mode, mode_of, report, table
-from experiments.runs.provenance import ROOT
 from shared.config import MemoryConfig
+from shared.provenance import ROOT
 from shared.rl.memory import SAMPLE, ReplayMemory
 from shared.rl.retention.rmm import recompute_marks
 from shared.rl.retention.strategy import Situation, discard

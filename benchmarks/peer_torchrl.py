@@ -21,9 +21,9 @@ from torchrl.data import LazyMemmapStorage, RemoteTensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.data.replay_buffers.writers import RoundRobinWriter
 
-from experiments.runs.provenance import ROOT
 from shared.facts import IMAGE_SHAPE
 from shared.messages import Episode
+from shared.provenance import ROOT
 
 CLIENT, SERVER = "client", "replay"
 THREADS = 4

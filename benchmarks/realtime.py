@@ -23,7 +23,6 @@ import numpy as np
 
 from benchmarks.distribution import connected
 from benchmarks.frame import Bar, Mode, mode_of, report, table
-from experiments.runs.provenance import ROOT
 from services.launcher.supervisor import Supervisor
 from services.launcher.up import child_specs, free_endpoint
 from shared import settings
@@ -32,6 +31,7 @@ from shared.config import Config
 from shared.keys import ACTION, LEARNER_STATE, OBSERVATION, ROBOT_STATE
 from shared.messages import Action, LearnerState, Observation, RobotState
 from shared.numerics import settle_all
+from shared.provenance import ROOT
 
 LONG = True
 PLAIN = [

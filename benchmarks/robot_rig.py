@@ -18,13 +18,13 @@ from typing import Any, Self, TypeVar
 
 import httpx
 
-from experiments.runs.provenance import ROOT
 from shared import settings
 from shared.bus import Bus
 from shared.config import Config
 from shared.errors import BusError, RouterMissing
 from shared.keys import ROBOT_COMMAND, ROBOT_STATE
 from shared.messages import RobotCommand, RobotState
+from shared.provenance import ROOT
 
 T = TypeVar("T")
 LEFT = "1"

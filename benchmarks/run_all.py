@@ -22,7 +22,7 @@ from typing import Any
 
 from benchmarks.frame import Bar, bar_row, from_json, table
 from benchmarks.peers import NOT_INSTALLED
-from experiments.runs.provenance import ROOT, machine
+from shared.provenance import ROOT, machine
 
 HERE = Path(__file__).parent
 RESULTS, PAGE = HERE / "results.json", ROOT / "docs" / "performance.md"

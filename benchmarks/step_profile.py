@@ -27,7 +27,6 @@ from benchmarks.distribution import (
 )
 from benchmarks.frame import Mode, mode_of, table
 from benchmarks.run_all import PAGE, renewed
-from experiments.runs.provenance import machine
 from experiments.single_process import SingleProcess
 from services.launcher.supervisor import Supervisor
 from services.launcher.up import child_specs, free_endpoint
@@ -35,6 +34,7 @@ from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import load_world
 from shared import settings
 from shared.config import Config
+from shared.provenance import machine
 
 ROBOTS = (1, 4)
 ZENOH = ("rx-", "tx-", "acc-", "app-", "net-")

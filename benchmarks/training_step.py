@@ -26,9 +26,9 @@ from benchmarks.frame import (
     times_table,
 )
 from benchmarks.frame import table as as_table
-from experiments.runs.provenance import ROOT
 from shared.config import Config, LearnerNumerics, LearningConfig, Numerics
 from shared.numerics import choose
+from shared.provenance import ROOT
 from shared.rl.learning import Trainer
 from shared.rl.network import QNetwork, load_bytes
 

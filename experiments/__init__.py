@@ -4,7 +4,7 @@ Read `single_process` first. Then, each group resting on those before:
 
 learning    environment, single_process
 driving     places, choosers, traces, evaluation, routes, references, tour, evaluate
-running     plan (data in plans/), provenance, recorder, probes, observer, snapshot, runner,
+running     plan (data in plans/), recorder, probes, observer, snapshot, runner,
             experiment, commands
 telling     records, runs, measures, statistics, comparisons, findings, tables, figures/, document,
             costs, report, results

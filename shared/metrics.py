@@ -1,51 +1,44 @@
-"""Metrics of a run: CSV files with one row per episode, and the same numbers for TensorBoard."""
+"""Tables of a run that grow by a row each episode, with the same numbers for TensorBoard."""
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 
 from torch.utils.tensorboard import SummaryWriter
 
-Row = Mapping[str, int | float | str]
+from shared.run_record import Row, append_csv, read_csv, write_csv
 
 
 class MetricsLog:
     """One CSV file whose first column is the global episode number, mirrored to TensorBoard.
 
     A restarted writer says which rows are certain; everything later is written again.
+
+    Args:
+        path: The file, in the folder of a run.
+        columns: Columns of the table; the last one is never empty.
     """
 
-    def __init__(self, folder: Path, name: str, columns: tuple[str, ...]) -> None:
-        self._path = folder / "metrics" / f"{name}.csv"
-        self._columns, self._name = columns, name
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        self._board = SummaryWriter(str(folder / "tensorboard" / name), flush_secs=10)
+    def __init__(self, path: Path, columns: tuple[str, ...]) -> None:
+        self._path, self._columns = path, columns
+        self._board = SummaryWriter(str(path.parent / "tensorboard" / path.stem), flush_secs=10)
 
     def restart(self, rows: Iterable[Row]) -> None:
         """Begin anew with exactly these rows."""
-        with self._path.open("w", newline="") as file:
-            writer = csv.DictWriter(file, self._columns)
-            writer.writeheader()
-            writer.writerows(rows)
+        write_csv(self._path, self._columns, rows)
 
-    def kept(self, upto: int) -> list[dict[str, str]]:
-        """Rows on disk whose episode is at most `upto`; a torn last line is left out."""
-        if not self._path.exists():
-            return []
-        with self._path.open(newline="") as file:
-            rows = [row for row in csv.DictReader(file) if row.get(self._columns[-1])]
-        return [row for row in rows if int(row["episode"]) <= upto]
+    def rows(self) -> list[dict[str, str]]:
+        """Rows on disk; a torn last line is left out. Raises ValueError for other columns."""
+        return read_csv(self._path, self._columns)
 
     def write(self, row: Row) -> None:
-        """Append one row; visible to readers when this returns."""
-        with self._path.open("a", newline="") as file:
-            csv.DictWriter(file, self._columns).writerow(row)
+        """Append one row; readers see it when this returns."""
+        append_csv(self._path, self._columns, [row])
         episode = int(row["episode"])
         for column, value in row.items():
             if column != "episode" and not isinstance(value, str):
-                self._board.add_scalar(f"{self._name}/{column}", value, episode)
+                self._board.add_scalar(f"{self._path.stem}/{column}", value, episode)
 
     def close(self) -> None:
         """Flush TensorBoard's file."""

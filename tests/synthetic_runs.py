@@ -14,9 +14,10 @@ import numpy as np
 from experiments.drives import routes
 from experiments.drives.routes import Event
 from experiments.drives.traces import Trace
-from experiments.records import EPISODE_COLUMNS, EVALUATION_COLUMNS, Row, write_csv
+from experiments.records import EVALUATION_COLUMNS
 from experiments.report.document import Findings, Missing, Picture, Section
 from experiments.report.run_folder import Experiment, load
+from shared.run_record import EPISODE_COLUMNS, Row, write_csv
 
 FACTOR = 10.0
 AFTER = {"plus-normm-fit": "plus-normm", "plus-minus": "plus-rmm", "i16c": "plus-minus"}

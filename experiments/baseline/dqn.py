@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-import json
 import math
 import shlex
 import sys
@@ -39,11 +38,11 @@ from experiments.drives.choosers import Chooser
 from experiments.drives.frozen_drives import evaluate
 from experiments.environment import CorridorEnv, Image
 from experiments.plans.plan import SCALES, Scale, load_plan, stage_config
-from experiments.records import EVALUATION_COLUMNS, append_csv, write_csv
-from experiments.runs.provenance import machine
+from experiments.records import EVALUATION_COLUMNS
 from services.robot_driver.simulated.world import WorldError
 from shared.config import Config
 from shared.errors import ConfigError
+from shared.run_record import RunInfo, StageInfo, append_csv, made_here, now_utc, write_csv
 from shared.statefile import write_atomically
 
 NAMES = {"progress": "dqn-progress", "distance": "dqn-distance"}
@@ -163,7 +162,7 @@ def run(plan: BaselinePlan, learner: Learner) -> None:
     `seconds` is the wall time of learning alone.
     """
     plan.out.mkdir(parents=True, exist_ok=True)
-    table, seconds, began = plan.out / "evaluations.csv", 0.0, _now()
+    table, seconds, began = plan.out / "evaluations.csv", 0.0, now_utc()
     write_csv(table, EVALUATION_COLUMNS, ())
     looker = CorridorEnv(config=plan.config)
     for number in range(1, EVALUATIONS + 1):
@@ -189,33 +188,32 @@ def run(plan: BaselinePlan, learner: Learner) -> None:
 
 def _told(plan: BaselinePlan, learner: Learner, seconds: float, began: str) -> bytes:
     """What was run, with the names that reports of experiments read."""
-    made, counts = machine(), {"actions": learner.actions, "train_steps": learner.train_steps}
-    stage = {
-        "name": STAGE, "world": plan.config.robot.world, "first_episode": 0, "last_episode": 0,
-        "seconds": round(seconds, 1), **counts,
-    }  # fmt: skip
-    told = {
-        "experiment": NAMES[plan.reward],
-        "title": f"DQN of Stable-Baselines3, reward {plan.reward}",
-        "scale": plan.scale,
-        "factor": plan.factor,
-        "memory_factor": plan.memory_factor,
-        "seed": plan.config.run.seed,
-        "command": plan.command,
-        "commit": made["commit"],
-        "machine": f"{made['cpu']}, {made['cores']} cores",
-        "python": made["python"],
-        "torch": made["torch"],
-        "started": began,
-        "finished": _now(),
-        "seconds": round(seconds, 1),
-        "episodes": 0,
-        "complete": True,
-        "stages": [stage],
-        "thesis": {},
+    counts = {"actions": learner.actions, "train_steps": learner.train_steps}
+    took_s = round(seconds, 1)
+    stage = StageInfo(
+        name=STAGE,
+        world=plan.config.robot.world,
+        first_episode=0,
+        last_episode=0,
+        seconds=took_s,
         **counts,
-    }
-    return (json.dumps(told, indent=2) + "\n").encode()
+    )
+    return RunInfo(
+        experiment=NAMES[plan.reward],
+        title=f"DQN of Stable-Baselines3, reward {plan.reward}",
+        scale=plan.scale,
+        factor=plan.factor,
+        memory_factor=plan.memory_factor,
+        seed=plan.config.run.seed,
+        command=plan.command,
+        **made_here(),
+        started=began,
+        finished=now_utc(),
+        complete=True,
+        seconds=took_s,
+        stages=(stage,),
+        **counts,
+    ).to_json()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -284,10 +282,6 @@ def _positive(text: str) -> int:
 def _refused(message: str) -> int:
     sys.stderr.write(f"baseline_dqn: {message}\n")
     return EXIT_USAGE
-
-
-def _now() -> str:
-    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
 
 
 if __name__ == "__main__":

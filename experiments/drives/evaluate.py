@@ -8,16 +8,17 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from experiments import records
 from experiments.drives import routes
 from experiments.drives.choosers import Chooser, Planned, greedy, uniform
 from experiments.drives.frozen_drives import evaluate
 from experiments.drives.traces import Figures
 from experiments.environment import CorridorEnv
+from experiments.records import EVALUATION_COLUMNS
 from services.commander import frozen
 from services.robot_driver.simulated.world import WorldError
 from shared.config import Config
 from shared.errors import ConfigError
+from shared.run_record import Row, write_csv
 
 LABEL = "evaluate"
 SHOWN = {
@@ -64,7 +65,7 @@ def run(path: Path, config: Config, starts: int, actions: int, out: Path) -> Non
     finally:
         env.close()
     rows = [_row(name, config, weights, figures) for name, figures in found.items()]
-    records.write_csv(out / "evaluation.csv", records.EVALUATION_COLUMNS, rows)
+    write_csv(out / "evaluation.csv", EVALUATION_COLUMNS, rows)
     Console().print(table(config.robot.world, found))
 
 
@@ -102,7 +103,7 @@ def _drive(
     return done.figures
 
 
-def _row(name: str, config: Config, weights: frozen.Frozen, figures: Figures) -> records.Row:
+def _row(name: str, config: Config, weights: frozen.Frozen, figures: Figures) -> Row:
     """The random driver and the planner have learnt nothing."""
     learnt = name == "network"
     known = {"episode": weights.episode, "train_steps": weights.train_steps} if learnt else {}

@@ -11,9 +11,10 @@ import numpy as np
 
 from experiments.report.figures.drives import Compared, laps
 from experiments.report.figures.progress import curve_of
-from experiments.report.run_folder import Experiment, Floats, Rows, Run, RunInfo
+from experiments.report.run_folder import Experiment, Floats, Rows, Run
 from experiments.report.statistics import bootstrap_difference
 from shared.rl.draws import generator
+from shared.run_record import RunInfo
 
 MISSING = float("nan")
 BOOTSTRAP_SEED = 0

@@ -1,12 +1,13 @@
-"""Runs of experiments as they lie on disk (`experiments/records.py`), read and checked.
+"""Runs of experiments and of the services as they lie on disk, read and checked.
 
-One folder per seed; seeds of one experiment at one scale belong together.
+`shared/run_record.py` and `experiments/records.py` tell what lies there. There is one folder per
+seed; seeds of one experiment at one scale belong together.
 """
 
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,20 +15,14 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from experiments.drives import routes
 from experiments.drives.routes import Route
-from experiments.records import (
-    EPISODE_COLUMNS,
-    EVALUATION_COLUMNS,
-    MemoryRecord,
-    TourRecord,
-    by_world,
-    read_csv,
-)
+from experiments.records import EVALUATION_COLUMNS, TourRecord
 from shared.errors import ConfigError, StateError
 from shared.facts import ACTION_COUNT, IMAGE_SHAPE
+from shared.run_record import RUN, SERVICES, RunInfo, read_csv, read_episodes, samples_by_world
 
 Floats = npt.NDArray[np.float64]
 
@@ -37,66 +32,14 @@ WINDOW = 100
 """The same at full scale (A37)."""
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(frozen=True)
-
-
-class StageInfo(_Record):
-    """A part of a run with settings of its own; episodes are counted globally."""
-
-    name: str
-    world: str
-    first_episode: int
-    last_episode: int | None = None
-    """None while the stage goes on."""
-
-
 @dataclass(frozen=True)
 class Stage:
-    """The same with an end, for figures: the newest episode while it goes on."""
+    """A stage with an end, for figures: the newest episode while it goes on."""
 
     name: str
     world: str
     first_episode: int
     last_episode: int
-
-
-class RunInfo(_Record):
-    """`run.json`: what was run, where, and how far it got."""
-
-    experiment: str
-    title: str
-    scale: str
-    factor: float = Field(gt=0.0)
-    """How many times fewer episodes than in the thesis; 1 at full scale."""
-    memory_factor: float = Field(default=1.0, gt=0.0)
-    """How many times smaller memories are."""
-    seed: int
-    after: str = ""
-    """The experiment whose end this one began with; empty for none."""
-    command: str
-    commit: str
-    machine: str
-    python: str
-    torch: str
-    started: str
-    finished: str
-    """Empty while the run goes on."""
-    seconds: float
-    actions: int
-    """So far, predecessors included."""
-    train_steps: int
-    """Likewise."""
-    complete: bool
-    prefill: str = ""
-    """Hash of the memory as the first episode began; empty for what keeps no such memory."""
-    first_lap: dict[str, float] = Field(default_factory=dict)
-    """When the frozen network first drove a lap; empty if it has not, or nobody looked."""
-    memory: MemoryRecord | None = None
-    """None for what keeps no such memory."""
-    stages: tuple[StageInfo, ...]
-    thesis: dict[str, Any]
-    """The thesis's numbers for this experiment, by the names of `measures.MEASURED`, or as text."""
 
 
 _TOURS = TypeAdapter(tuple[TourRecord, ...])
@@ -173,7 +116,11 @@ class Run:
         steps = self.episodes.numbers("train_steps")
         if not len(steps):
             return 0 if self.info.after else self.info.train_steps
-        return int(steps[-1] - steps[0] + self.episodes.numbers("mini_batches")[0])
+        known = np.flatnonzero(~np.isnan(steps))  # the learner may be some episodes behind
+        if not len(known):
+            return 0
+        own_of_first = self.episodes.numbers("mini_batches")[known[0]]
+        return int(steps[known[-1]] - steps[known[0]] + own_of_first)
 
     @property
     def one_action_share(self) -> float:
@@ -205,7 +152,7 @@ class Run:
     @cached_property
     def samples_by_world(self) -> dict[str, Floats]:
         """Samples in the memory after every episode, by corridor: float64 [episodes] each."""
-        counts = [by_world(text) for text in self.episodes.words("by_world")]
+        counts = [samples_by_world(text) for text in self.episodes.words("by_world")]
         names = sorted({name for count in counts for name in count})
         return {name: np.array([float(c.get(name, 0)) for c in counts]) for name in names}
 
@@ -284,12 +231,14 @@ def _seed_folders(folders: Iterable[Path]) -> list[Path]:
 
 def read_run(folder: Path) -> Run:
     """Read one seed. Raises StateError naming the file that is not what it should be."""
-    info = read_info(folder / "run.json")
+    info, episodes = read_info(folder / RUN), _rows(lambda: read_episodes(folder))
+    if info.scale == SERVICES:
+        info = info.model_copy(update=_totals(episodes))
     return Run(
         folder,
         info,
-        _table(folder / "episodes.csv", EPISODE_COLUMNS),
-        _table(folder / "evaluations.csv", EVALUATION_COLUMNS),
+        episodes,
+        _rows(lambda: read_csv(folder / "evaluations.csv", EVALUATION_COLUMNS)),
         tuple(_probes(path) for path in sorted(folder.glob("probes-*.npz"))),
         {
             path.stem.removeprefix("route-"): routes.read(path)
@@ -323,11 +272,22 @@ def _first_line(error: Exception) -> str:
     return str(error)
 
 
-def _table(path: Path, columns: tuple[str, ...]) -> Rows:
+def _totals(episodes: Rows) -> dict[str, float]:
+    """What `run.json` of a run of the services leaves to its tables: the largest number of each."""
+    columns = {"seconds": "seconds", "actions": "total_actions", "train_steps": "train_steps"}
+    found = {name: episodes.numbers(column) for name, column in columns.items()}
+    return {
+        name: float(np.nanmax(values)) if name == "seconds" else int(np.nanmax(values))
+        for name, values in found.items()
+        if np.any(~np.isnan(values))
+    }
+
+
+def _rows(read: Callable[[], list[dict[str, str]]]) -> Rows:
     try:
-        return Rows(tuple(read_csv(path, columns)))
-    except (ValueError, EOFError, OSError) as error:
-        raise StateError(f"{path}: {error}") from error
+        return Rows(tuple(read()))
+    except (ValueError, OSError) as error:
+        raise StateError(str(error)) from error
 
 
 def _arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
@@ -348,6 +308,8 @@ def _probes(path: Path) -> Probes:
     if images.shape[1:] != IMAGE_SHAPE or images.dtype != np.uint8:
         raise StateError(f"{path}: expected images uint8 [n, 50, 75], got {images.shape}")
     if values.shape != (len(images), ACTION_COUNT):
-        raise StateError(f"{path}: expected values [{len(images)}, 3], got {values.shape}")
+        raise StateError(
+            f"{path}: expected values [{len(images)}, {ACTION_COUNT}], got {values.shape}"
+        )
     label = path.stem.removeprefix("probes-")
     return Probes(label, world, images, values.astype(np.float64))

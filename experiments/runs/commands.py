@@ -8,8 +8,8 @@ from typing import get_args
 
 from rich.console import Console
 
-from experiments.runs.schedule import OUT, run_experiment
 from experiments.plans.plan import SCALES, Scale, load_plan, plan_names
+from experiments.runs.schedule import OUT, run_experiment
 from shared.errors import ConfigError
 
 

@@ -6,24 +6,20 @@ import hashlib
 
 import numpy as np
 
-from experiments.records import MemoryRecord, Row
 from experiments.single_process import SingleProcess, TurnDone
 from shared.rl.memory import ReplayMemory
-from shared.facts import SHORT_NAMES
+from shared.run_record import MemoryRecord, Row, turn_columns
 
 
 def episode_row(loop: SingleProcess, done: TurnDone, stage: str, seconds: float) -> Row:
-    """A row of `episodes.csv` (`records.EPISODE_COLUMNS`) about the turn just done."""
-    submitted, discarded = done.submitted, done.maintenance.discarded
-    counters, memory, trainer = loop.counters, loop.memory, loop.trainer
+    """A row of `episodes.csv` (`run_record.EPISODE_COLUMNS`) about the turn just done."""
+    submitted, counters, trainer = done.submitted, loop.counters, loop.trainer
     losses = [trained.loss for trained in done.trained if trained.loss is not None]
-    by_action = memory.by_action()
-    by_world = np.bincount(memory.rows["world"], minlength=len(memory.worlds))
-    counts = zip(memory.worlds, by_world, strict=True)
     return {
         "episode": done.commit.episode,
         "stage": stage,
         "world": submitted.worlds[-1] if submitted.worlds else "",
+        "robot": submitted.robot,
         "ended": submitted.ended,
         "bump": int(submitted.bump),
         "fitness": submitted.fitness,
@@ -33,6 +29,7 @@ def episode_row(loop: SingleProcess, done: TurnDone, stage: str, seconds: float)
         "laps_left": counters.laps_left,
         "laps_right": counters.laps_right,
         "longest_run_actions": counters.longest_run_actions,
+        "samples": done.commit.stored,
         "mini_batches": len(done.trained),
         "loss": f"{float(np.mean(losses)):.6g}" if losses else "",
         "fitting": int(any(trained.batches for trained in done.trained)),
@@ -40,13 +37,8 @@ def episode_row(loop: SingleProcess, done: TurnDone, stage: str, seconds: float)
         "fits": trainer.fits,
         "weights_version": trainer.version,
         "target_age": done.commit.episode - trainer.episode_at_copy,
-        "memory": len(memory),
-        "capacity": memory.capacity,
-        **dict(zip(SHORT_NAMES, by_action, strict=True)),
-        "by_world": " ".join(f"{name}={count}" for name, count in counts),
-        "discarded": len(discarded.ids),
-        "equalised": int(done.maintenance.equalised),
-        **discarded.told,
+        "acting_version": submitted.weights_version,
+        **turn_columns(loop.memory, done.maintenance),
         "seconds": round(seconds, 2),
     }
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from experiments.runs import probes
 from experiments.drives.choosers import greedy
-from experiments.environment import CorridorEnv, with_world
 from experiments.drives.frozen_drives import drive_from_first_start, evaluate
-from experiments.runs.probes import Probes
 from experiments.drives.references import reference
 from experiments.drives.tour import Tour, drive_tour
 from experiments.drives.traces import Figures, first_lap
+from experiments.environment import CorridorEnv, with_world
+from experiments.runs import probes
+from experiments.runs.probes import Probes
 from services.robot_driver.robot import Pose
 from shared.config import Config, PolicyConfig
 from shared.rl.predictor import Predictor

@@ -1,7 +1,8 @@
 """One run of a plan: stages, records, frozen evaluations and snapshots round the reference loop.
 
-Everything a run writes is listed in `records`. A run interrupted at any moment goes on from its
-last snapshot as if nothing had happened; what was recorded after that snapshot is written again.
+Everything a run writes is listed in `experiments.records` and `shared.run_record`. A run that is
+interrupted at any moment goes on from its last snapshot as if nothing had happened; what was
+recorded after that snapshot is written again.
 """
 
 from __future__ import annotations
@@ -16,17 +17,15 @@ from typing import Any, get_args
 
 import numpy as np
 
-from experiments import records
-from experiments.runs import probes
 from experiments.drives import routes
-from experiments.runs import snapshot
-from experiments.runs.observer import Observer
-from experiments.plans.plan import Plan, Scale, Stage, merged, stage_config
-from experiments.runs.provenance import machine, machine_key
-from experiments.runs.episode_row import episode_row, held, memory_hash
 from experiments.drives.references import DRIVERS
-from experiments.single_process import SingleProcess, TurnDone
 from experiments.drives.traces import Figures
+from experiments.plans.plan import Plan, Scale, Stage, merged, stage_config
+from experiments.records import EVALUATION_COLUMNS
+from experiments.runs import probes, snapshot
+from experiments.runs.episode_row import episode_row, held, memory_hash
+from experiments.runs.observer import Observer
+from experiments.single_process import SingleProcess, TurnDone
 from services.replay.numbering import bump_free
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import load_world
@@ -34,9 +33,23 @@ from shared.config import Config
 from shared.errors import ConfigError, StateError
 from shared.messages import WorldChange
 from shared.numerics import Role, settle
+from shared.provenance import machine_key
 from shared.rl.network import to_bytes
 from shared.rl.retention.rmm import force_candidates
 from shared.rl.retention.strategy import begin
+from shared.run_record import (
+    EPISODE_COLUMNS,
+    EPISODES,
+    RUN,
+    Row,
+    RunInfo,
+    StageInfo,
+    append_csv,
+    made_here,
+    now_utc,
+    read_csv,
+    write_csv,
+)
 from shared.settings import claim
 from shared.statefile import write_atomically
 
@@ -104,7 +117,7 @@ class Run:
     ) -> None:
         self.plan, self.folder, self.seed = plan, folder, seed
         self._scale: Scale = scale
-        self._command, self._started = command, time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+        self._command, self._started = command, now_utc()
         first = claim(folder, stage_config(plan, 0, seed))
         common = folder.parents[1] / "machines" / machine_key(first)
         roles = {role: settle(first, folder, role, common) for role in get_args(Role)}
@@ -280,7 +293,7 @@ class Run:
         for world in worlds:
             figures = self._observer.evaluate(world, starts, actions)
             rows.append(self._evaluation_row(label, "network", world, figures))
-        records.append_csv(self.folder / "evaluations.csv", records.EVALUATION_COLUMNS, rows)
+        append_csv(self.folder / "evaluations.csv", EVALUATION_COLUMNS, rows)
 
     def _drive_tours(self) -> None:
         """Test drives with turns on the spot (A45): their routes, and `tours.json` about all."""
@@ -296,15 +309,15 @@ class Run:
     def _refer(self) -> None:
         """Record floor and ceiling of all worlds that were driven in, at the end of the record."""
         settings, kept = self.plan.evaluation, self.folder.parents[1] / "references"
-        path, columns = self.folder / "evaluations.csv", records.EVALUATION_COLUMNS
+        path, columns = self.folder / "evaluations.csv", EVALUATION_COLUMNS
         drives, rows = (settings.starts, settings.actions), []
-        for world in sorted({row["world"] for row in records.read_csv(path, columns)}):
+        for world in sorted({row["world"] for row in read_csv(path, columns)}):
             for driver in DRIVERS:
                 figures = self._observer.reference(world, driver, *drives, kept)
                 rows.append(self._evaluation_row("reference", driver, world, figures))
-        records.append_csv(path, columns, rows)
+        append_csv(path, columns, rows)
 
-    def _evaluation_row(self, label: str, driver: str, world: str, figures: Figures) -> records.Row:
+    def _evaluation_row(self, label: str, driver: str, world: str, figures: Figures) -> Row:
         counters = self._loop.counters
         return {
             "label": label,
@@ -362,45 +375,41 @@ class Run:
         if done.target_changed:
             self._driving = to_bytes(self._loop.trainer.target_network)
         row = episode_row(self._loop, done, self._stage_name, totals.seconds)
-        records.append_csv(self.folder / "episodes.csv", records.EPISODE_COLUMNS, [row])
+        append_csv(self.folder / EPISODES, EPISODE_COLUMNS, [row])
 
     def _write_run(self, *, complete: bool) -> None:
-        counters, plan, made = self._loop.counters, self.plan, machine()
+        counters, plan, totals = self._loop.counters, self.plan, self._totals
+        mini = plan.mini if self._scale == "mini" else None
         episodes = counters.episode - self._offset
-        memory = held(self._loop.memory)
-        run = {
-            "experiment": plan.name,
-            "title": plan.title,
-            "source": plan.source,
-            "scale": self._scale,
-            "factor": plan.mini.factor if self._scale == "mini" else 1,
-            "memory_factor": plan.mini.memories_by if self._scale == "mini" else 1,
-            "seed": self.seed,
-            "after": plan.after,
-            "command": self._command,
-            "commit": made["commit"],
-            "machine": f"{made['cpu']}, {made['cores']} cores",
-            "python": made["python"],
-            "torch": made["torch"],
-            "numerics": self._numerics.model_dump(mode="json"),
-            "started": self._started,
-            "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()) if complete else "",
-            "complete": complete,
-            "seconds": round(self._totals.seconds, 1),
-            "episodes": episodes,
-            "one_action_share": _short(self._totals.one_action_episodes / max(episodes, 1)),
-            "actions": counters.actions,
-            "fill_actions": self._all_actions - counters.actions,
-            "train_steps": self._loop.trainer.train_steps,
-            "longest_run": self._totals.longest_run,
-            "prefill": self._totals.prefill,
-            "first_lap": self._totals.first_lap,
-            "memory": memory and memory.model_dump(),
-            "stages": self._totals.stages,
-            "thesis": plan.thesis,
-        }
-        text = json.dumps(run, indent=2) + "\n"
-        write_atomically(self.folder / "run.json", text.encode())
+        info = RunInfo(
+            experiment=plan.name,
+            title=plan.title,
+            source=plan.source,
+            scale=self._scale,
+            factor=mini.factor if mini else 1,
+            memory_factor=mini.memories_by if mini else 1,
+            seed=self.seed,
+            after=plan.after,
+            command=self._command,
+            **made_here(),
+            numerics=self._numerics.model_dump(mode="json"),
+            started=self._started,
+            finished=now_utc() if complete else "",
+            complete=complete,
+            seconds=round(totals.seconds, 1),
+            episodes=episodes,
+            one_action_share=_short(totals.one_action_episodes / max(episodes, 1)),
+            actions=counters.actions,
+            fill_actions=self._all_actions - counters.actions,
+            train_steps=self._loop.trainer.train_steps,
+            longest_run=totals.longest_run,
+            prefill=totals.prefill,
+            first_lap=totals.first_lap,
+            memory=held(self._loop.memory),
+            stages=tuple(StageInfo.model_validate(stage) for stage in totals.stages),
+            thesis=plan.thesis,
+        )
+        write_atomically(self.folder / RUN, info.to_json())
 
     # ------------------------------------------------------------ snapshots
 
@@ -456,12 +465,12 @@ class Run:
         """Rows written after the snapshot come again."""
         newest = self._loop.counters.episode if self._totals.stages else 0
         for name, columns in (
-            ("episodes.csv", records.EPISODE_COLUMNS),
-            ("evaluations.csv", records.EVALUATION_COLUMNS),
+            (EPISODES, EPISODE_COLUMNS),
+            ("evaluations.csv", EVALUATION_COLUMNS),
         ):
             path = self.folder / name
-            rows = [r for r in records.read_csv(path, columns) if int(r["episode"]) <= newest]
-            records.write_csv(path, columns, rows)
+            rows = [r for r in read_csv(path, columns) if int(r["episode"]) <= newest]
+            write_csv(path, columns, rows)
 
     def _progress(self) -> Progress:
         episode = self._loop.counters.episode - self._offset

@@ -57,10 +57,11 @@ def _add_service(app: typer.Typer, process: Process) -> None:
 
 def serve(process: Process, config: Config, folder: Path) -> int:
     """Run one service until it stops; returns its exit code."""
+    from shared import run_record
     from shared.service import guarded, setup_logging, starting
     from shared.settings import claim
 
-    claim(folder, config)
+    run_record.begin(folder, claim(folder, config))
     setup_logging(process.name, folder)
 
     def run() -> None:

@@ -24,7 +24,7 @@ from services.launcher.supervisor import ChildSpec, Ending, Supervisor
 from services.monitor.heartbeats import Reader, Snapshot
 from services.monitor.running import locked
 from services.processes import COMMAND, ROUTER, SERVICES, Process
-from shared import settings
+from shared import run_record, settings
 from shared.bus import Bus
 from shared.config import BusConfig, Config
 from shared.errors import ConfigError, RouterMissing
@@ -59,6 +59,7 @@ def run_all(config: Config, folder: Path, *, listen: str | None, given: bool) ->
             f"--listen: starts an own router, but bus.endpoint {config.bus.endpoint!r} was given"
         )
     stored = settings.claim(folder, config)
+    run_record.begin(folder, stored)
     with locked(folder) as lock, stop_on_signals() as stop:
         settle_all(stored, folder)  # now, while nothing else runs
         own = None if given else listen or free_endpoint()

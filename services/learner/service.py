@@ -19,13 +19,11 @@ from shared.metrics import MetricsLog
 from shared.numerics import settle
 from shared.rl.learning import Trained, Trainer
 from shared.rl.network import to_bytes, weights_hash
+from shared.run_record import TRAINING, TRAINING_COLUMNS
 from shared.service import TICK_S, Service, Stopped, service
 from shared.weights import parts
 
 Activity = Literal["waiting", "synchronising", "training", "fitting", "checkpoint"]
-COLUMNS = (
-    "episode mini_batches loss fitting seconds train_steps fits weights_version target_age memory"
-)
 
 
 def run(config: Config, folder: Path) -> None:
@@ -47,8 +45,9 @@ class LearnerLoop:
         self._mirror = Mirror()
         self._weights = to_bytes(self._trainer.target_network)
         self._hash = weights_hash(self._weights)
-        self._metrics = MetricsLog(folder, "training", tuple(COLUMNS.split()))
-        self._metrics.restart(self._metrics.kept(self.episode))
+        self._metrics = MetricsLog(folder / TRAINING, TRAINING_COLUMNS)
+        certain = (row for row in self._metrics.rows() if int(row["episode"]) <= self.episode)
+        self._metrics.restart(list(certain))
         self._activity: Activity = "waiting"
         self._trained = Trained(0.0, 0, 0, 0)
         self._loss: float | None = None
@@ -160,14 +159,13 @@ class LearnerLoop:
             {
                 "episode": turn.episode,
                 "mini_batches": mini_batches,
-                "loss": self._loss if self._loss is not None else "none",
+                "loss": self._loss if self._loss is not None else "",
                 "fitting": int(mini_batches > 0 and self._trained.batches > 0),
-                "seconds": round(seconds, 3),
                 "train_steps": trainer.train_steps,
                 "fits": trainer.fits,
                 "weights_version": trainer.version,
                 "target_age": turn.episode - trainer.episode_at_copy,
-                "memory": len(self._mirror.samples),
+                "turn_seconds": round(seconds, 3),
             }
         )
 

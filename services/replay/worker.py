@@ -7,6 +7,7 @@ and applies the result in one transaction. Killed at any moment, it does the tur
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -24,17 +25,12 @@ from shared.numerics import settle
 from shared.rl.memory import ReplayMemory
 from shared.rl.predictor import Predictor
 from shared.rl.retention.strategy import strategy
-from shared.rl.retention.table import TELLS
 from shared.rl.turn import Maintenance, maintain
+from shared.run_record import EPISODES, REPLAY_COLUMNS, STAGE, turn_columns
 from shared.service import TICK_S, Service, Stopped
 from shared.weights import WeightsFetcher
 
 Activity = Literal["idle", "committing", "descriptors", "equalising", "discarding", "waiting"]
-COLUMNS = (
-    "episode robot ended bump fitness fitness_mean_100 actions total_actions bumps laps_left "
-    "laps_right longest_run_actions samples memory capacity discarded equalised "
-    + " ".join((*TELLS, "weights_version"))
-)
 
 
 @dataclass(frozen=True)
@@ -69,7 +65,8 @@ class TurnWorker(threading.Thread):
         self._wake = threading.Event()
         self._predictor = Predictor(me.config.network, settle(me.config, folder, "replay"))
         self.weights = WeightsFetcher(me, lambda: None)
-        self._metrics = MetricsLog(folder, "episodes", tuple(COLUMNS.split()))
+        self._metrics = MetricsLog(folder / EPISODES, REPLAY_COLUMNS)
+        self._began_s = 0.0
         self._recent: deque[int] = deque(maxlen=100)
         self.failure: BaseException | None = None
         self.view = View(storage.position())
@@ -122,7 +119,9 @@ class TurnWorker(threading.Thread):
         )
         if commit.episode:  # written first: a row without its turn is dropped at the next start
             self._recent.append(int(record["fitness"]))
-            self._metrics.write(self._row(commit, record, memory, done))
+            worlds = submission.rows["world"]
+            world = memory.worlds[int(worlds[-1])] if len(worlds) else ""
+            self._metrics.write(self._row(commit, record, world, memory, done))
         position = self._storage.apply_turn(submission, memory, done)
         if done.discarded.warning:
             self._me.log.warning("episode %d: %s", commit.episode, done.discarded.warning)
@@ -156,26 +155,29 @@ class TurnWorker(threading.Thread):
         self._notify()
 
     def _row(
-        self, commit: Commit, record: dict[str, Any], memory: ReplayMemory, done: Maintenance
+        self,
+        commit: Commit,
+        record: dict[str, Any],
+        world: str,
+        memory: ReplayMemory,
+        done: Maintenance,
     ) -> dict[str, int | float | str]:
-        extra = {
-            "memory": len(memory),
-            "capacity": done.discarded.capacity,
-            "discarded": len(done.discarded.ids),
-            "equalised": int(done.equalised),
-            **done.discarded.told,
+        return {
+            **self._basic_row(commit, record),
+            "world": world,
+            **turn_columns(memory, done),
+            "seconds": round(time.monotonic() - self._began_s, 2),
         }
-        return {**self._basic_row(commit, record), **extra}
 
     def _basic_row(self, commit: Commit, record: dict[str, Any]) -> dict[str, int | float | str]:
         totals = record["totals"]
         return {
             "episode": commit.episode,
+            "stage": STAGE,
             "robot": record["robot"],
             "ended": record["ended"],
             "bump": int(record["bump"]),
             "fitness": record["fitness"],
-            "fitness_mean_100": round(float(np.mean(self._recent)), 2),
             "actions": record["actions"],
             "total_actions": totals["actions"],
             "bumps": totals["bumps"],
@@ -183,13 +185,15 @@ class TurnWorker(threading.Thread):
             "laps_right": totals["laps_right"],
             "longest_run_actions": totals["longest_run_actions"],
             "samples": commit.stored,
-            "weights_version": record["weights_version"],
+            "acting_version": record["weights_version"],
         }
 
     def _restart_metrics(self) -> None:
         """Make the CSV agree with what is on disk: rows of unprocessed episodes come again."""
         processed = self.view.position.processed
-        written = {int(row["episode"]): row for row in self._metrics.kept(2**62)}
+        found = self._metrics.rows()
+        self._began_s = time.monotonic() - (float(found[-1]["seconds"]) if found else 0.0)
+        written = {int(row["episode"]): row for row in found}
         rows: list[dict[str, int | float | str]] = []
         for record in self._storage.records():
             commit = Commit(**record["commit"])

@@ -124,7 +124,7 @@ class Trial:
 
     def rows(self) -> list[dict[str, str]]:
         """The episodes that are through the whole loop so far, as replay wrote them down."""
-        path = f"runs/{RUN}/metrics/episodes.csv"
+        path = f"runs/{RUN}/episodes.csv"
         text = self.compose("exec", "-T", "replay", "cat", path, check=False)
         lines = text.splitlines(keepends=True)
         whole = [line for line in lines if line.endswith("\n")]  # not one just being written

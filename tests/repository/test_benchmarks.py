@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks import frame, frames, run_all
 from benchmarks.frame import Bar
-from experiments.runs import provenance
+from shared import provenance
 
 FIELDS = {
     "id", "value", "unit", "better", "required", "aim", "baseline_median", "ours_median", "n",

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from benchmarks import peer_learning, peer_transport, peers, run_all
-from experiments.runs.provenance import ROOT
+from shared.provenance import ROOT
 
 SCRIPTS = ("peer_learning", "peer_replay", "peer_transport")
 CHUNK = peer_transport.CHUNK_BYTES

@@ -58,7 +58,7 @@ def test_undisturbed_run_equals_the_single_process_loop(
         cluster.stop_all()
     assert_equal(reference, distributed(config, tmp_path / "run"))
     assert state is not None
-    with (tmp_path / "run" / "metrics" / "episodes.csv").open(newline="") as file:
+    with (tmp_path / "run" / "episodes.csv").open(newline="") as file:
         capacities = [int(row["capacity"]) for row in csv.DictReader(file)]
     assert state.capacity == capacities[-1] == reference.memory.capacity
     assert {420, 430} <= set(capacities) <= {400, 420, 430}

@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 from waiting import wait_until
 
+from experiments.report.run_folder import read_run
+
 pytestmark = pytest.mark.system
 
 CORRIDOR = [sys.executable, "-m", "services.cli"]
@@ -52,7 +54,7 @@ def corridor(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def episode_numbers(folder: Path) -> list[int]:
-    with (folder / "metrics" / "episodes.csv").open() as stream:
+    with (folder / "episodes.csv").open() as stream:
         return [int(row["episode"]) for row in csv.DictReader(stream)]
 
 
@@ -63,8 +65,17 @@ def test_a_run_ends_by_itself_and_is_continued_by_the_same_command(tmp_path: Pat
     assert "8 episodes are done" in finish(start(tmp_path, "--episodes", "8"), 90)
     assert episode_numbers(tmp_path) == list(range(1, len(episode_numbers(tmp_path)) + 1))
     assert len(episode_numbers(tmp_path)) >= 8
-    for name in ("config.toml", "metrics", "logs", "tensorboard"):
+    for name in ("config.toml", "run.json", "training.csv", "logs", "tensorboard"):
         assert (tmp_path / name).exists(), name
+    run = read_run(tmp_path)
+    assert (run.info.scale, run.info.actions) == ("services", run.actions)
+    assert run.train_steps > 0 < run.info.seconds
+    reported = corridor("report", str(tmp_path), "--out", str(tmp_path / "report"))
+    assert reported.returncode == 0, reported.stderr
+    assert "Run of the services" in (tmp_path / "report" / "report.html").read_text()
+    quick = ("--starts", "1", "--actions", "50", "--out", str(tmp_path / "evaluated"))
+    evaluated = corridor("evaluate", str(tmp_path), *quick)
+    assert evaluated.returncode == 0, evaluated.stderr
     other = corridor("up", "--run-dir", str(tmp_path), "--set", "network.filters=16")
     assert other.returncode == 2
     assert "network.filters is 8 there, but 16 now" in other.stderr
@@ -96,7 +107,7 @@ def test_a_running_run_is_found_watched_commanded_and_stopped(tmp_path: Path) ->
 def test_killed_services_are_restarted_and_the_run_goes_on(tmp_path: Path) -> None:
     process = start(tmp_path)
     try:
-        wait_until((tmp_path / "metrics" / "episodes.csv").exists, 40, "metrics")
+        wait_until((tmp_path / "episodes.csv").exists, 40, "metrics")
         for name in ("replay", "router", "actor"):
             os.kill(started(tmp_path, name)[-1], signal.SIGKILL)
             wait_until(partial(was_restarted, tmp_path, name), 20, f"{name} again")

@@ -15,11 +15,12 @@ from experiments.baseline.dqn import EVALUATIONS, BaselinePlan, DistanceReward, 
 from experiments.drives.choosers import Chooser, uniform
 from experiments.environment import CorridorEnv
 from experiments.plans.plan import load_plan, stage_config
-from experiments.records import EVALUATION_COLUMNS, read_csv
+from experiments.records import EVALUATION_COLUMNS
 from experiments.report.run_folder import read_info
 from services.robot_driver.robot import Pose
 from shared.config import Config
 from shared.facts import FORWARD, FORWARD_LEFT
+from shared.run_record import read_csv
 
 
 class Pretender:

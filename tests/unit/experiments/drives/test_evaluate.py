@@ -9,11 +9,12 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from experiments import records
 from experiments.drives import routes
+from experiments.records import EVALUATION_COLUMNS
 from services.cli import main as cli
 from services.commander import frozen
 from services.learner import checkpoint
+from shared import run_record
 from shared.config import Config, NetworkConfig
 from shared.rl.learning import Trainer
 from shared.rl.network import initialised, to_bytes
@@ -46,7 +47,7 @@ def test_table_csv_routes_and_pictures(
     said = capsys.readouterr().out
     assert "minus: 120 actions without learning" in said
     assert f"written to {out}" in said
-    rows = records.read_csv(out / "evaluation.csv", records.EVALUATION_COLUMNS)
+    rows = run_record.read_csv(out / "evaluation.csv", EVALUATION_COLUMNS)
     assert [row["driver"] for row in rows] == ["network", "random", "planner"]
     assert [row["label"] for row in rows] == ["evaluate", "reference", "reference"]
     assert all(row["world"] == "minus" and row["actions"] == "120" for row in rows)
@@ -68,7 +69,7 @@ def test_another_world_can_be_named(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     words = ["--world", "plus", "--starts", 1, "--actions", 2, "--out", out]
     assert corridor("evaluate", run, *words) == 0
-    rows = records.read_csv(out / "evaluation.csv", records.EVALUATION_COLUMNS)
+    rows = run_record.read_csv(out / "evaluation.csv", EVALUATION_COLUMNS)
     assert {row["world"] for row in rows} == {"plus"}
 
 

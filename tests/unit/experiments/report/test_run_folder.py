@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.records import EPISODE_COLUMNS, write_csv
 from experiments.report.run_folder import load, read_run
 from shared.errors import ConfigError, StateError
+from shared.run_record import EPISODE_COLUMNS, write_csv
 from tests.synthetic_runs import write_probes, write_route, write_run
 
 NAME = "policy-roulette"

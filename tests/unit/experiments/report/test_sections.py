@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from experiments.plans.plan import presentations
-from experiments.records import EPISODE_COLUMNS, EVALUATION_COLUMNS, write_csv
+from experiments.records import EVALUATION_COLUMNS
 from experiments.report.document import Picture, Section, Table
 from experiments.report.figures.drives import BUMPS, COVERAGE, DISTANCE, LAPS, panels
 from experiments.report.run_folder import Experiment, load, read_run
 from experiments.report.sections import section_of
+from shared.run_record import EPISODE_COLUMNS, write_csv
 from tests.synthetic_runs import experiment, missing, sentences, titles, write_route, write_run
 
 

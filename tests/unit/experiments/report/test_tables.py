@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.records import EVALUATION_COLUMNS, read_csv, write_csv
+from experiments.records import EVALUATION_COLUMNS
 from experiments.report import findings, tables
 from experiments.report.document import Table
 from experiments.report.full_report import all_sections
@@ -16,6 +16,7 @@ from experiments.report.overview import overview
 from experiments.report.run_folder import load
 from experiments.report.tables import frozen, tours
 from shared.errors import StateError
+from shared.run_record import read_csv, write_csv
 from tests.synthetic_runs import write_run
 
 LAP = {"seconds": 61.5, "actions": 8123, "episode": 40, "train_steps": 94}

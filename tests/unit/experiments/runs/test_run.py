@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import records
-from experiments.runs.schedule import Job, _distinct, chain, shares_of
 from experiments.plans.plan import Plan, read_plan
+from experiments.records import EVALUATION_COLUMNS, WALL_TIME
 from experiments.runs.run import Progress, Run
+from experiments.runs.schedule import Job, _distinct, chain, shares_of
+from shared import run_record
 from shared.errors import ConfigError, StateError
 
 TEXT = """
@@ -116,12 +117,12 @@ def run(
 def tables(folder: Path) -> dict[str, list[dict[str, str]]]:
     """All tables without the wall time."""
     found = {
-        "episodes": records.read_csv(folder / "episodes.csv", records.EPISODE_COLUMNS),
-        "evaluations": records.read_csv(folder / "evaluations.csv", records.EVALUATION_COLUMNS),
+        "episodes": run_record.read_csv(folder / "episodes.csv", run_record.EPISODE_COLUMNS),
+        "evaluations": run_record.read_csv(folder / "evaluations.csv", EVALUATION_COLUMNS),
     }
     for rows in found.values():
         for row in rows:
-            del row[records.WALL_TIME]
+            del row[WALL_TIME]
     return found
 
 
@@ -185,9 +186,9 @@ def test_a_chain_goes_on_where_its_predecessor_ended(finished: Path) -> None:
     assert int(after[0]["episode"]) == int(before[-1]["episode"]) + 1
     assert int(after[0]["train_steps"]) == int(before[-1]["train_steps"]) + 1
     assert [row["world"] for row in after] == ["minus"] * 3 + ["plus"] * 4
-    assert records.by_world(after[0]["by_world"]).keys() == {"plus", "minus"}
-    kept = records.by_world(before[-1]["by_world"])["plus"]
-    assert records.by_world(after[0]["by_world"])["plus"] <= kept
+    assert run_record.samples_by_world(after[0]["by_world"]).keys() == {"plus", "minus"}
+    kept = run_record.samples_by_world(before[-1]["by_world"])["plus"]
+    assert run_record.samples_by_world(after[0]["by_world"])["plus"] <= kept
 
 
 def test_the_record_of_a_run_says_how_to_repeat_it(finished: Path) -> None:

@@ -1,4 +1,4 @@
-"""What figures were made with and on: commit, processor, versions."""
+"""What a run or a measurement was made with: commit, processor, versions."""
 
 from __future__ import annotations
 
@@ -8,26 +8,25 @@ import os
 import platform
 import shutil
 import subprocess
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import torch
 
 if TYPE_CHECKING:
     from shared.config import Config
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 RECORDED = (":!docs", ":!benchmarks/results.json", ":!benchmarks/results.md")
 """Text, and what measuring writes: no change to what is measured."""
 
 
 def machine() -> dict[str, str]:
-    """What figures were measured on."""
+    """Processor, cores and versions here, as `run.json` and tables of benchmarks name them."""
     return {
         "cpu": _processor(),
         "cores": str(len(os.sched_getaffinity(0))),
         "python": platform.python_version(),
-        "torch": torch.__version__,
+        "torch": _torch(),
         "commit": commit(),
     }
 
@@ -35,7 +34,7 @@ def machine() -> dict[str, str]:
 def machine_key(config: Config) -> str:
     """8 hex digits over what decides which arithmetic is the fastest one."""
     decides = {
-        "machine": [_processor(), len(os.sched_getaffinity(0)), torch.__version__],
+        "machine": [_processor(), len(os.sched_getaffinity(0)), _torch()],
         "network": config.network.model_dump(mode="json"),
         "numerics": config.numerics.model_dump(mode="json"),
         "learning": [config.learning.batch_size, config.learning.mode],
@@ -55,6 +54,14 @@ def commit() -> str:
 
     changed = said("status", "--porcelain", "--untracked-files=no", "--", ".", *RECORDED)
     return said("rev-parse", "--short", "HEAD") + ("+" if changed else "")
+
+
+def _torch() -> str:
+    """The version that is installed, found without importing it; empty where there is none."""
+    try:
+        return metadata.version("torch")
+    except metadata.PackageNotFoundError:
+        return ""
 
 
 def _processor() -> str:

@@ -1,0 +1,42 @@
+"""One record of a run, whoever writes it: begun once, tables joined, other tables refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from shared import run_record
+from shared.config import Config
+from shared.run_record import EPISODE_COLUMNS, REPLAY_COLUMNS, TRAINING_COLUMNS, RunInfo
+
+
+def test_a_run_of_the_services_is_recorded_as_it_begins_and_never_again(tmp_path: Path) -> None:
+    config = Config.model_validate({"run": {"name": "first", "seed": 7}})
+    run_record.begin(tmp_path, config)
+    written = (tmp_path / "run.json").read_bytes()
+    info = RunInfo.model_validate_json(written)
+    assert (info.experiment, info.scale, info.seed) == ("first", "services", 7)
+    assert [(stage.world, stage.first_episode) for stage in info.stages] == [("plus", 1)]
+    assert all((info.command, info.commit, info.machine, info.python, info.torch, info.started))
+    run_record.begin(tmp_path, config)
+    assert (tmp_path / "run.json").read_bytes() == written
+
+
+def test_what_the_learner_wrote_is_joined_by_episode(tmp_path: Path) -> None:
+    rows = [dict.fromkeys(REPLAY_COLUMNS, "1") | {"episode": n} for n in (1, 2)]
+    run_record.write_csv(tmp_path / "episodes.csv", REPLAY_COLUMNS, rows)
+    first, second = run_record.read_episodes(tmp_path)
+    assert first["loss"] == ""  # the learner has not come that far
+    training = dict.fromkeys(TRAINING_COLUMNS, "3") | {"episode": 2, "loss": 0.5}
+    run_record.write_csv(tmp_path / "training.csv", TRAINING_COLUMNS, [training])
+    first, second = run_record.read_episodes(tmp_path)
+    assert (first["loss"], second["loss"], second["train_steps"]) == ("", "0.5", "3")
+    assert set(EPISODE_COLUMNS) <= second.keys()
+
+
+@pytest.mark.parametrize("header", ["", "stage,episode", "episode,colour"])
+def test_a_table_of_another_schema_is_refused(tmp_path: Path, header: str) -> None:
+    (tmp_path / "episodes.csv").write_text(f"{header}\n")
+    with pytest.raises(ValueError, match=r"episodes\.csv: expected the columns episode, stage"):
+        run_record.read_episodes(tmp_path)
