@@ -1,4 +1,6 @@
-"""The whole system in one process: the parts wired by function calls, no bus, no disk, no threads.
+"""The whole system in one process: the parts wired by function calls, without bus or disk.
+
+One thread runs it all; only gradients are computed by as many threads as `numerics.learner` says.
 
 Read this first: it is the algorithm of Fig 3.2 in the order of E25, made of exactly the parts the
 services are made of; robot and driver together are the Gymnasium environment that everybody else

@@ -57,6 +57,10 @@ def test_one_file_imports_pybullet() -> None:
     assert users("pybullet") == {"services/robot_driver/simulated/scene.py"}
 
 
+def test_one_file_imports_httpx() -> None:
+    assert users("httpx") == {"services/robot_driver/real/robotino.py"}
+
+
 def test_one_file_imports_lmdb() -> None:
     assert users("lmdb") == {"services/replay/tables.py"}
 

@@ -39,9 +39,9 @@ from pathlib import Path
 from builders import FakePredictor, make_episode
 
 from services.replay.storage import Storage
-from services.replay.worker import COLUMNS
 from shared.config import MemoryConfig
 from shared.rl.turn import maintain
+from shared.run_record import REPLAY_COLUMNS
 
 config = MemoryConfig(capacity=30, fill="none", strategy="alternate")
 told = []
@@ -61,7 +61,7 @@ for number in (1, 2, 3):
     storage.close()
 assert told == [0, 1, 2], told
 assert memory.rows["outlived"].tolist() == [2] * 10 + [1] * 10, memory.rows["outlived"]
-assert "discards" in COLUMNS
+assert "discards" in REPLAY_COLUMNS
 """
 
 
