@@ -39,14 +39,13 @@ def test_maps_are_the_same_bits_and_gradients_point_the_same_way(layout: Any, fi
     assert torch.equal(plain, reduced)
     expected, found = gradients(network, plain), gradients(network, reduced)
     assert found.keys() == expected.keys()
+    bound = LARGEST_ERROR if filters == 4 else 0.01  # more filters: errors cancel each other
     for name, gradient in found.items():
         assert gradient.dtype == torch.float32
         assert gradient.shape == expected[name].shape
         cosine = torch.cosine_similarity(gradient.flatten(), expected[name].flatten(), dim=0)
         assert float(cosine) > 0.999, name
-        assert float(gradient.norm() / expected[name].norm()) == pytest.approx(
-            1.0, abs=LARGEST_ERROR
-        )
+        assert float(gradient.norm() / expected[name].norm()) == pytest.approx(1.0, abs=bound)
     whole = [torch.cat([g.flatten() for g in each.values()]) for each in (found, expected)]
     assert float(torch.cosine_similarity(*whole, dim=0)) > 0.9999
 
