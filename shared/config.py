@@ -159,9 +159,9 @@ class RobotConfig(Section):
     period_s: float = Field(default=0.25, gt=0.01, le=2.0)
     """Time one action lasts."""
     speed_m_s: float = Field(default=0.6, gt=0.0, le=2.0)
-    """Forward speed of all three actions (A21, E31)."""
+    """Forward speed of all actions (A21, E31)."""
     turn_rad_s: float = Field(default=math.radians(80.0), gt=0.0, le=3.0)
-    """Turn rate of the actions that turn (A21, E31)."""
+    """Turn rate of the actions that turn fully (A21, E31)."""
     max_speed_m_s: float = Field(default=0.8, gt=0.0, le=2.0)
     """Clamp: commands are cut to it."""
     max_turn_rad_s: float = Field(default=1.5, gt=0.0, le=3.0)

@@ -24,8 +24,8 @@ class ActionKind(NamedTuple):
     """One word for columns and narrow tables, such as "left". It is unique."""
     vector: tuple[float, ...]
     """What the network gets as its second input (A21). All vectors have one length."""
-    turn: int
-    """Direction of the turn: 1 left (anticlockwise), 0 none, -1 right."""
+    turn: float
+    """Turn as a share of the turn rate: 1 full left (anticlockwise), 0 none, -1 full right."""
     mirror: str
     """`short` of the action that does the same in a mirror."""
 

@@ -43,7 +43,7 @@ Interruption = Literal["", "pause", "estop", "late", "stop", "restart", "world",
 """Why the robot did not simply execute the last action; empty: it did. blocked: a real robot was
 not fit to drive, `RobotState.reason` said why."""
 Motion = Literal["", "turn-left", "turn-right", "forward", "back"]
-"""A motion that is none of the three actions: turning on the spot, or creeping to another place."""
+"""A motion that is none of the actions: turning on the spot, or creeping to another place."""
 
 
 class Message(BaseModel):
@@ -114,7 +114,7 @@ class Action(Message):
     holds still. It counts as no action: `sequence` stays, and the next observation says "moved"."""
     greedy: bool
     values: ActionValues
-    """Clipped predictions Q(s, a) of the three actions, for the monitor."""
+    """Clipped predictions Q(s, a) of all actions, for the monitor."""
     weights_version: Count
     episode: Count = 0
     """Counted episodes of the robot so far, as far as the actor knows; 0 while the memory fills.
@@ -278,7 +278,7 @@ class Episode(Message):
     images: bytes
     """uint8 [n, 50, 75]."""
     sample_actions: bytes
-    """uint8 [n], 0..2."""
+    """uint8 [n], numbers of `facts.ACTIONS`."""
     sample_rewards: bytes
     """float32 [n], -1..1."""
     sample_steps: bytes
@@ -306,8 +306,8 @@ class Episode(Message):
         EPISODE.check(self, n)
         if self.bump != (self.ended == "bump"):
             raise ValueError(f"bump is {self.bump}, but the episode ended {self.ended!r}")
-        if max(self.sample_actions) > 2:
-            raise ValueError(f"sample_actions: expected 0..2, got {max(self.sample_actions)}")
+        if (most := max(self.sample_actions)) >= ACTION_COUNT:
+            raise ValueError(f"sample_actions: expected 0..{ACTION_COUNT - 1}, got {most}")
         if max(self.sample_worlds) >= len(self.worlds):
             raise ValueError("sample_worlds: index outside worlds")
         rewards = np.frombuffer(self.sample_rewards, "<f4")

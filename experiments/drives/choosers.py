@@ -51,7 +51,7 @@ def uniform(observation: Observation, draw: np.random.Generator) -> int:  # noqa
 
 
 class Planned:
-    """Drives by the map: the ceiling of what three actions can do.
+    """Drives by the map: the ceiling of what the actions can do.
 
     Where there is a lap centre it drives laps, in the direction it looks when it plans; elsewhere
     it keeps as far from walls as it can, which says how few bumps are possible but nothing about

@@ -26,7 +26,7 @@ class Batch(NamedTuple):
     def mirrored(self, which: Tensor) -> Batch:
         """The batch with some samples, bool [k], seen in a mirror: left is right, rewards stay.
 
-        The robot and its three actions are symmetrical, so what it would have got in the mirrored
+        The robot and its actions are symmetrical, so what it would have got in the mirrored
         corridor is known.
         """
         images = torch.where(which[:, None, None], self.images.flip(-1), self.images)

@@ -19,13 +19,13 @@ def decide(
     Args:
         config: Seed, policy, and how the memory is filled.
         robot: Id of the robot.
-        values: Clipped Q of all actions, float32 [3].
+        values: Clipped Q of all actions, float32 [actions].
         filling: The memory is still being filled.
         episode: Fill submissions of the robot so far while filling, else its counted episodes.
         step: Steps in its open episode so far.
 
     Returns:
-        The action 0..2, and whether the greedy branch chose it.
+        The number of the action, and whether the greedy branch chose it.
     """
     role = "fill" if filling else "policy"
     draw = generator(config.run.seed, role, robot, episode, step)

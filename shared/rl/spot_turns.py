@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-from shared.facts import FORWARD_LEFT
+from shared.facts import ACTIONS
 from shared.rl.policy import Values
 
 MOST_TURNING_RAD = math.radians(720.0)
@@ -22,7 +22,7 @@ class SpotTurns:
     """When to turn on the spot, and to which side.
 
     Args:
-        turn_rad: Of one turn, which lasts as long as an action.
+        turn_rad: Angle of one turn, which lasts as long as an action.
     """
 
     def __init__(self, turn_rad: float) -> None:
@@ -34,13 +34,13 @@ class SpotTurns:
         """The side to turn to now, or empty: drive the action.
 
         Args:
-            values: Clipped predictions of the three actions.
+            values: Clipped predictions of all actions.
             action: The best of them.
         """
         if values[action] >= 0.0 or self._turns >= self._most:
             self._side, self._turns = "", 0
             return ""
         if not self._side:
-            self._side = "left" if action == FORWARD_LEFT else "right"
+            self._side = "left" if ACTIONS[action].turn > 0 else "right"
         self._turns += 1
         return self._side
