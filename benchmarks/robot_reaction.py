@@ -19,8 +19,8 @@ from statistics import median
 from benchmarks.frame import Bar, Mode, mode_of, report, rounds_of, table
 from benchmarks.robot_rig import Rig
 from services.launcher.up import free_endpoint
-from services.robot_driver.driver import action_velocity
 from services.robot_driver.emulation.dynamics import ROBOTINO
+from services.robot_driver.motion_control import action_velocity
 from shared import settings
 from shared.config import Config
 from shared.messages import RobotState

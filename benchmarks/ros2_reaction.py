@@ -19,8 +19,8 @@ from statistics import median
 from benchmarks.frame import Bar, Mode, mode_of, report, rounds_of, table
 from benchmarks.ros2_rig import Ros2Rig
 from services.launcher.up import free_endpoint
-from services.robot_driver.driver import action_velocity
 from services.robot_driver.emulation.dynamics import CREATE3, ROBOTINO, STEP_S
+from services.robot_driver.motion_control import action_velocity
 from shared import settings
 from shared.config import Config
 

@@ -15,7 +15,7 @@ from statistics import median
 import numpy as np
 
 from benchmarks.frame import Bar, Mode, mode_of, report, table
-from services.robot_driver.driver import action_velocity
+from services.robot_driver.motion_control import action_velocity
 from services.robot_driver.robot import Velocity
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import load_world

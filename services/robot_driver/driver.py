@@ -1,23 +1,19 @@
 """The driver of one robot: observations out, actions in, safety always (no bus in here).
 
-The service and the single-process loop both use it. A robot only senses and moves (`robot.py`);
-sequence numbers, bumps, recovery and limits are decided here.
+The service and the single-process loop both use it. A robot only senses and moves (`robot.py`).
+How it moves is decided in `motion_control.py`; sequence numbers, bumps and commands are here.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any, Literal
 
 from services.robot_driver.host import Host
-from services.robot_driver.recovery import Halted, WatchedRobot, back_off, let_go
-from services.robot_driver.robot import STANDSTILL, NotReady, Pose, Robot, Velocity
+from services.robot_driver.motion_control import MotionControl
+from services.robot_driver.robot import NotReady, Pose, Robot
 from services.robot_driver.safety import Safety
 from services.robot_driver.world_changes import Outcome, WorldChanges, described
 from shared.config import Config
-from shared.facts import ACTIONS
 from shared.messages import (
     MAX_FAULTS,
     Action,
@@ -29,26 +25,8 @@ from shared.messages import (
     WorldChange,
     WorldChanged,
 )
-from shared.rl.draws import generator
 
 State = Literal["waiting", "driving", "recovering", "blocked", "paused", "estop", "stopped"]
-SLICE_S = 0.02
-"""Realtime: how often commands, bumper and deadman are looked at within a period."""
-
-
-def action_velocity(config: Config, action: int) -> Velocity:
-    """Body velocity of an action (A21): forward, and turning where the action turns."""
-    turn_rad_s = ACTIONS[action].turn * config.robot.turn_rad_s
-    return Velocity(config.robot.speed_m_s, 0.0, turn_rad_s)
-
-
-def motion_velocity(config: Config, motion: Motion) -> Velocity:
-    """Body velocity of a motion that is no action: turning as in actions (A45), or creeping."""
-    robot = config.robot
-    if motion in ("turn-left", "turn-right"):
-        return Velocity(0.0, 0.0, robot.turn_rad_s if motion == "turn-left" else -robot.turn_rad_s)
-    sense = {"forward": 1.0, "back": -1.0}.get(motion, 0.0)
-    return Velocity(sense * robot.recovery_speed_m_s, 0.0, 0.0)
 
 
 class Driver:
@@ -58,6 +36,7 @@ class Driver:
         self._config, self._robot, self._host = config, robot, host or Host()
         self.life = life
         self.safety = Safety(config.robot)
+        self._control = MotionControl(config, robot, self.safety, self._host)
         self.state: State = "waiting"
         self.sequence = 0
         self.attempt = 0
@@ -68,9 +47,6 @@ class Driver:
         self._changes = WorldChanges(robot.changeable)
         self._bump = False
         self._interruption: Interruption = ""
-        self._moving = False
-        self._motion: Motion = ""
-        """The motion in force, or just over; empty: an action."""
         self._pose = Pose(0.0, 0.0, 0.0)
 
     @property
@@ -119,8 +95,7 @@ class Driver:
 
     def start(self, action: int) -> None:
         """Begin to drive an action, within the limits."""
-        self._motion = ""
-        self._drive(self.safety.allow(action_velocity(self._config, action), self._robot.now_s()))
+        self._control.start_action(action)
         self.state = "driving"
 
     def move(self, motion: Motion) -> None:
@@ -135,34 +110,17 @@ class Driver:
 
         False: the bumper is pressed, so the robot stands still; nobody knows from which side.
         """
-        if self._robot.feel().contact:
-            self.halt()
-            return False
-        self._motion = motion
-        velocity = motion_velocity(self._config, motion)
-        self._drive(self.safety.allow(velocity, self._robot.now_s()))
-        self.state = "driving"
-        return True
+        started = self._control.start_motion(motion)
+        if started:
+            self.state = "driving"
+        return started
 
     def advance(self, duration_s: float) -> bool:
         """Let time pass; True at contact, where the robot has already stopped.
 
         With the recovery `none` contact does not stop an action, but it does stop a motion.
         """
-        stop = self._config.robot.recovery != "none" or self._motion != ""
-        contact = self._robot.run(duration_s, stop_on_contact=stop)
-        if contact and stop:
-            self._drive(STANDSTILL)
-        self.enforce()
-        return contact
-
-    def enforce(self) -> None:
-        """Stop a robot whose last action is too old, or that is halted."""
-        if self._moving and self.safety.halted:
-            self._drive(STANDSTILL)
-        elif self._moving and self.safety.expired(self._robot.now_s()):
-            self.safety.count_deadman()
-            self._drive(STANDSTILL)
+        return self._control.advance(duration_s)
 
     def settle(self, bump: bool, *, executed: bool = True) -> None:
         """The action or motion is over: count it, recover from a bump, look anew.
@@ -173,13 +131,15 @@ class Driver:
         """
         self._bump, self._interruption = bump, ""
         self.bumps += int(bump)
-        if self._motion:
+        if self._control.motion:
             if bump:
-                self._let_go(self._motion)
+                self.state = "recovering"
+                self._control.let_go()
             self.look_again("moved")
             return
         if bump and self._config.robot.recovery == "back-off":
-            self._recover()
+            self.state = "recovering"
+            self.recoveries += self._control.back_off(self.sequence)
         self._count(executed=executed)
         self.state = "waiting"
 
@@ -199,7 +159,7 @@ class Driver:
         A bump at that moment is counted and not recovered from: nobody knows when it goes on. It
         ends the action in force, which counts as executed, before the robot is blocked (E42).
         """
-        if bump and not self._motion:
+        if bump and not self._control.motion:
             self._bump, self._interruption = True, ""
             self._count(executed=self.state == "driving")
         self.halt()
@@ -220,8 +180,7 @@ class Driver:
 
     def halt(self) -> None:
         """Stand still now; may be called in any state."""
-        self._motion = ""
-        self._drive(STANDSTILL)
+        self._control.halt()
 
     def command(self, command: Literal["estop", "clear", "pause", "resume"]) -> None:
         """Carry out an operator's command. A latched e-stop yields to `clear` alone."""
@@ -232,7 +191,8 @@ class Driver:
                 self.look_again("estop")
             self.safety.estop = False
         else:
-            if command == "resume" and self.safety.paused and self._realtime:
+            realtime = self._config.robot.timing == "realtime"
+            if command == "resume" and self.safety.paused and realtime:
                 self.look_again("pause")
             self.safety.paused = command == "pause"
         if self.safety.halted:
@@ -336,10 +296,6 @@ class Driver:
         """
         self._changes.restore_kept(kept)
 
-    @property
-    def _realtime(self) -> bool:
-        return self._config.robot.timing == "realtime"
-
     def _carry_out(self, episode: int) -> list[Outcome]:
         """Carry out what is due; the robot then stands still and looks again."""
         outcomes = self._changes.carry_out(episode)
@@ -369,41 +325,3 @@ class Driver:
             self.sequence, self.attempt = self.sequence + 1, 0
         else:
             self.attempt += 1
-
-    def _drive(self, velocity: Velocity) -> None:
-        self._robot.drive(velocity)
-        self._moving = velocity.moving
-
-    def _recover(self) -> None:
-        """Back off by real motion and turn to a random heading drawn from the seed (E11)."""
-        draw = generator(self._config.run.seed, "recovery", self._config.robot.id, self.sequence)
-        heading_rad = float(draw.uniform(-math.pi, math.pi))
-        with self._recovering() as robot:
-            back_off(robot, self._config.robot, heading_rad)
-            self.recoveries += 1
-
-    def _let_go(self, motion: Motion) -> None:
-        """After contact in a straight motion: back the way it came until the bumper is free."""
-        direction = {"forward": -1.0, "back": 1.0}.get(motion)
-        if direction is not None:
-            with self._recovering() as robot:
-                let_go(robot, self._config.robot, direction)
-
-    @contextmanager
-    def _recovering(self) -> Iterator[WatchedRobot]:
-        """A robot that moves by itself, within the limits and watched, until the block ends.
-
-        The block may break off; the robot stands still after it in any case.
-        """
-        self.state = "recovering"
-        slice_s = SLICE_S if self._realtime else None
-        robot = WatchedRobot(self._robot, self.safety, self._host, slice_s)
-        try:
-            yield robot
-            if self._config.robot.kind != "sim":  # it still moves when told to stop
-                robot.run(self._config.robot.hardware.rest_s, stop_on_contact=False)
-        except Halted:  # it stands where it was stopped; the operator's `clear`, or the restart,
-            pass  # tells the actor
-        except NotReady:  # it stands; the next look tells why, and the actor
-            self.halt()
-        self._moving = False

@@ -7,9 +7,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from services.robot_driver.driver import SLICE_S, Driver
+from services.robot_driver.driver import Driver
 from services.robot_driver.host import Host
 from services.robot_driver.kinds import make_robot
+from services.robot_driver.motion_control import SLICE_S
 from services.robot_driver.robot import NotReady
 from shared import statefile
 from shared.bus import Inbox

@@ -87,7 +87,7 @@ import numpy as np
 from cluster import make_config
 
 from experiments.single_process import SingleProcess
-from services.robot_driver.driver import action_velocity
+from services.robot_driver.motion_control import action_velocity
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import load_world
 from shared.facts import MIRRORED

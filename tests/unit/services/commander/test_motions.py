@@ -14,7 +14,8 @@ from pydantic import ValidationError
 
 from services.commander.commander import refuse_others
 from services.commander.drive import DriveTally
-from services.robot_driver.driver import Driver, motion_velocity
+from services.robot_driver.driver import Driver
+from services.robot_driver.motion_control import motion_velocity
 from services.robot_driver.robot import STANDSTILL, Felt, ForwardingRobot, Velocity
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import load_world

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.robot_driver.driver import Driver, action_velocity
+from services.robot_driver.driver import Driver
+from services.robot_driver.motion_control import action_velocity
 from services.robot_driver.robot import STANDSTILL, Felt, Pose, Robot, Sensed, Velocity
 from services.robot_driver.safety import Safety
 from shared.config import Config, RobotConfig

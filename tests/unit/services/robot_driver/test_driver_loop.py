@@ -17,8 +17,9 @@ from fake_link import FakeLink, config_of
 from waiting import wait_until
 
 from services.robot_driver import service
-from services.robot_driver.driver import SLICE_S, Driver
+from services.robot_driver.driver import Driver
 from services.robot_driver.host import Host
+from services.robot_driver.motion_control import SLICE_S
 from services.robot_driver.real.hardware import HardwareRobot
 from services.robot_driver.recovery import WatchedRobot, back_off
 from services.robot_driver.robot import STANDSTILL, Felt, Pose, Velocity

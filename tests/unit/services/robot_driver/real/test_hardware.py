@@ -11,8 +11,9 @@ import pytest
 from fake_link import FakeLink, config_of
 from waiting import wait_until
 
-from services.robot_driver.driver import Driver, action_velocity
+from services.robot_driver.driver import Driver
 from services.robot_driver.kinds import make_robot
+from services.robot_driver.motion_control import action_velocity
 from services.robot_driver.real.gate import ZEROS
 from services.robot_driver.real.hardware import HardwareRobot
 from services.robot_driver.robot import STANDSTILL, NotReady, Pose, RobotFault, Velocity
