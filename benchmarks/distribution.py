@@ -23,9 +23,10 @@ from services.launcher.up import child_specs, free_endpoint
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import load_world
 from shared import settings
-from shared.bus import Bus, Inbox
+from shared.bus import Bus
 from shared.config import ActorNumerics, Config, Numerics
 from shared.errors import RouterMissing
+from shared.inbox import Inbox
 from shared.keys import OBSERVATION
 from shared.messages import Observation
 from shared.numerics import choose

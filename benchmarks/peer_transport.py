@@ -30,8 +30,9 @@ from benchmarks.transfer import learner_state
 from services.launcher.supervisor import Supervisor
 from services.launcher.up import child_specs, free_endpoint
 from shared import settings
-from shared.bus import Bus, Inbox
+from shared.bus import Bus
 from shared.config import Config
+from shared.inbox import Inbox
 from shared.keys import LEARNER_STATE, WEIGHTS
 from shared.rl.network import initialised, to_bytes
 from shared.weights import parts

@@ -30,8 +30,9 @@ from benchmarks.prefilled import EPISODE_SAMPLES, LIFE, bus, fill, make_episode,
 from services.launcher.up import free_endpoint
 from services.learner.mirror import Mirror
 from shared import settings
-from shared.bus import Bus, Inbox
+from shared.bus import Bus
 from shared.config import ActorNumerics, Config
+from shared.inbox import Inbox
 from shared.keys import EPISODE, LEARNER_STATE, REPLAY_STATE, WEIGHTS
 from shared.messages import EpisodeAck, LearnerState, ReplayState
 from shared.numerics import choose, settle_all

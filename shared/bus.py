@@ -1,21 +1,11 @@
-"""Everything that touches Zenoh: sessions, publishing, inboxes, requests, liveliness.
-
-Zenoh's callbacks only put bytes into bounded places of an `Inbox`; the one thread that owns the
-inbox decodes and acts. Undecodable, oversized and overflowing messages are counted by stream.
-"""
+"""Everything that touches Zenoh: sessions, publishing, subscribing, requests, liveliness."""
 
 from __future__ import annotations
 
 import json
-import logging
 import re
-import threading
-import time
-from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Self, TypeVar
 
 import zenoh
@@ -31,15 +21,11 @@ from shared.errors import (
     PeerSilent,
     RouterMissing,
 )
+from shared.inbox import Inbox
 from shared.keys import Peer, Stream, alive_key, ident_in, parse_alive
 from shared.messages import Message
 
-log = logging.getLogger(__name__)
 M = TypeVar("M", bound=Message)
-MAX_SENDERS = 64
-"""Senders of one `latest` stream an inbox keeps apart; more are refused and counted."""
-TAP_MESSAGES, TAP_BYTES = 20_000, 64 * 1024 * 1024
-"""Most that waits at a tap."""
 REPLY_LIMIT = 16 * 1024 * 1024
 """Bytes of one reply; larger ones are refused."""
 
@@ -78,19 +64,27 @@ def zenoh_config(
 class Request:
     """One request waiting for its answer. Use as a context manager: leaving finishes it."""
 
-    def __init__(self, stream: Stream, query: zenoh.Query, message: Message) -> None:
-        self.stream, self.message, self._query = stream, message, query
+    message: Message
+    """What is asked, once it is read."""
+
+    def __init__(self, stream: Stream, query: zenoh.Query) -> None:
+        self.stream, self._query = stream, query
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._query.drop()  # type: ignore[no-untyped-call]
+
+    @property
+    def size(self) -> int:
+        """Bytes of the message."""
+        return len(self._query.payload or b"")
+
+    def read(self) -> None:
+        """Decode the message. Raises BadMessage."""
+        payload = self._query.payload
+        self.message = decode(payload.to_bytes() if payload else b"", self.stream.request)
 
     def reply(self, message: Message) -> None:
         """Send one answer; several are allowed where the stream says so."""
@@ -99,187 +93,6 @@ class Request:
     def refuse(self, reason: str) -> None:
         """Answer with an error in one line."""
         self._query.reply_err(reason.encode())
-
-
-class Inbox:
-    """Where messages for one thread arrive. All methods but the callbacks belong to that thread."""
-
-    def __init__(self, bus: Bus) -> None:
-        self._bus = bus
-        self._ready = threading.Condition()
-        self._arrivals = 0
-        self._seen = 0
-        self._latest: dict[tuple[str, str], bytes] = {}
-        self._queues: dict[str, deque[zenoh.Query]] = {}
-        self._streams: dict[str, Stream] = {}
-        self.refused: Counter[str] = Counter()
-        """Messages not taken, by stream: undecodable, oversized, badly addressed or overflowing."""
-
-    def subscribe(self, stream: Stream, ident: str = "*") -> None:
-        """Keep the newest message of every matching sender of a `latest` stream."""
-        key = stream.wildcard(self._bus.run) if ident == "*" else stream.key(self._bus.run, ident)
-
-        def on_sample(sample: zenoh.Sample) -> None:
-            payload = sample.payload
-            sender = ident_in(stream, str(sample.key_expr))
-            with self._ready:
-                slot = (stream.name, sender or "")
-                full = slot not in self._latest and len(self._latest) >= MAX_SENDERS
-                if sender is None or len(payload) > stream.max_bytes or full:
-                    self.refused[stream.name] += 1
-                    return
-                self._latest[slot] = payload.to_bytes()
-                self._arrivals += 1
-                self._ready.notify_all()
-
-        self._bus.subscriber(key, on_sample)
-
-    def serve(self, stream: Stream, ident: str = "main") -> None:
-        """Queue the requests of a `request` stream; when full, answer "busy" at once."""
-        queue = self._queues.setdefault(stream.name, deque())
-        self._streams[stream.name] = stream
-
-        def on_query(query: zenoh.Query) -> None:
-            payload = query.payload
-            with self._ready:
-                if payload is None or len(payload) > stream.max_bytes:
-                    self.refused[stream.name] += 1
-                    problem = f"expected 1..{stream.max_bytes} bytes of payload"
-                elif len(queue) >= stream.queue:
-                    self.refused[stream.name] += 1
-                    problem = "busy"
-                else:
-                    queue.append(query)
-                    self._arrivals += 1
-                    self._ready.notify_all()
-                    return
-            query.reply_err(problem.encode())
-            query.drop()  # type: ignore[no-untyped-call]
-
-        self._bus.queryable(stream.key(self._bus.run, ident), on_query)
-
-    def wait(self, timeout_s: float) -> bool:
-        """Wait until something arrives that was not waited for before; False at the timeout."""
-        with self._ready:
-            arrived = self._ready.wait_for(lambda: self._arrivals > self._seen, timeout_s)
-            self._seen = self._arrivals
-            return arrived
-
-    def wake(self) -> None:
-        """Let the owner's `wait` return (for shutdown; any thread)."""
-        with self._ready:
-            self._arrivals += 1
-            self._ready.notify_all()
-
-    def take(self, stream: Stream, cls: type[M]) -> list[tuple[str, M]]:
-        """The newest unread message of each sender of a `latest` stream, decoded."""
-        with self._ready:
-            slots = [slot for slot in self._latest if slot[0] == stream.name]
-            raw = [(slot[1], self._latest.pop(slot)) for slot in slots]
-        taken = []
-        for sender, data in raw:
-            try:
-                message = decode(data, cls)
-                if getattr(message, "robot", sender) != sender and "{id}" in stream.pattern:
-                    raise BadMessage(f"{cls.__name__} of {message!r:.60} under the key of {sender}")
-            except BadMessage as error:
-                self._refuse(stream, error)
-                continue
-            taken.append((sender, message))
-        return taken
-
-    def requests(self) -> Iterator[Request]:
-        """All requests queued now, decoded; those that are no valid message are answered so."""
-        while True:
-            with self._ready:
-                name = next((name for name, queue in self._queues.items() if queue), None)
-                if name is None:
-                    return
-                query = self._queues[name].popleft()
-            stream = self._streams[name]
-            try:
-                payload = query.payload
-                message: Message = decode(payload.to_bytes() if payload else b"", stream.request)
-            except BadMessage as error:
-                self._refuse(stream, error)
-                query.reply_err(f"bad message: {error}".encode())
-                query.drop()  # type: ignore[no-untyped-call]
-                continue
-            yield Request(stream, query, message)
-
-    def _refuse(self, stream: Stream, error: BadMessage) -> None:
-        with self._ready:
-            self.refused[stream.name] += 1
-            count = self.refused[stream.name]
-        if count & (count - 1) == 0:  # 1, 2, 4, 8 ...: visible, never a flood
-            log.warning("%s: message refused (%d so far): %s", stream.name, count, error)
-
-    @property
-    def refused_total(self) -> int:
-        """All messages not taken so far."""
-        return sum(self.refused.values())
-
-
-@dataclass(frozen=True)
-class Heard:
-    """A published message as it came: nothing of it is checked but its size and its key."""
-
-    stream: Stream
-    ident: str
-    """Of the sender, from the key."""
-    time_ns: int
-    """When it arrived, by the clock of this computer since 1970."""
-    data: bytes
-
-
-class Tap:
-    """Every message of `latest` streams, in the order of arrival, for one thread that keeps up.
-
-    At most `TAP_MESSAGES` of them and `TAP_BYTES` wait; what comes beyond that is lost and counted.
-    """
-
-    def __init__(self, bus: Bus, streams: Sequence[Stream]) -> None:
-        self._bus = bus
-        self._ready = threading.Condition()
-        self._waiting: deque[Heard] = deque()
-        self._bytes = 0
-        self._woken = False
-        self.lost: Counter[str] = Counter()
-        """Messages not taken, by stream: too many waiting, oversized or badly addressed."""
-        for stream in streams:
-            self._listen(stream)
-
-    def _listen(self, stream: Stream) -> None:
-        def on_sample(sample: zenoh.Sample) -> None:
-            payload = sample.payload
-            ident = ident_in(stream, str(sample.key_expr))
-            with self._ready:
-                size = len(payload)
-                room = len(self._waiting) < TAP_MESSAGES and self._bytes + size <= TAP_BYTES
-                if ident is None or size > stream.max_bytes or not room:
-                    self.lost[stream.name] += 1
-                    return
-                self._waiting.append(Heard(stream, ident, time.time_ns(), payload.to_bytes()))
-                self._bytes += size
-                self._ready.notify_all()
-
-        self._bus.subscriber(stream.wildcard(self._bus.run), on_sample)
-
-    def take(self, timeout_s: float) -> list[Heard]:
-        """All that waits, as soon as there is something; empty at the timeout or when woken."""
-        with self._ready:
-            self._ready.wait_for(lambda: bool(self._waiting) or self._woken, timeout_s)
-            self._woken = False
-            taken = list(self._waiting)
-            self._waiting.clear()
-            self._bytes = 0
-            return taken
-
-    def wake(self) -> None:
-        """Let `take` return (any thread)."""
-        with self._ready:
-            self._woken = True
-            self._ready.notify_all()
 
 
 class Bus:
@@ -305,12 +118,7 @@ class Bus:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -321,22 +129,39 @@ class Bus:
         """A new inbox for one thread."""
         return Inbox(self)
 
-    def tap(self, streams: Sequence[Stream]) -> Tap:
-        """Hear everything of these `latest` streams from now on."""
-        return Tap(self, streams)
+    def subscribe(
+        self, stream: Stream, ident: str, receive: Callable[[str | None, bytes], None]
+    ) -> None:
+        """Receive the messages of one sender of a `latest` stream, or of all (`*`).
 
-    def subscriber(self, key: str, callback: Any) -> None:
-        """Declare a subscriber that lives as long as the bus.
-
-        The callback runs on Zenoh's own thread, one change of threads nearer to who waits for the
-        message: it must only enqueue.
+        Args:
+            stream: The stream.
+            ident: The sender.
+            receive: Takes sender and bytes of a message. The sender is None, and the bytes are
+                empty, where the key is of no sender or the message too large. It runs on Zenoh's
+                own thread, one change of threads nearer to who waits for the message: it must only
+                enqueue.
         """
-        direct = zenoh.handlers.Callback(callback, indirect=False)
+        key = stream.wildcard(self.run) if ident == "*" else stream.key(self.run, ident)
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            sender = ident_in(stream, str(sample.key_expr))
+            if sender is None or len(sample.payload) > stream.max_bytes:
+                receive(None, b"")
+            else:
+                receive(sender, sample.payload.to_bytes())
+
+        direct = zenoh.handlers.Callback(on_sample, indirect=False)
         self._declared.append(self._session.declare_subscriber(key, direct))
 
-    def queryable(self, key: str, callback: Any) -> None:
-        """Declare a queryable that lives as long as the bus."""
-        self._declared.append(self._session.declare_queryable(key, callback, complete=True))
+    def serve(self, stream: Stream, ident: str, receive: Callable[[Request], None]) -> None:
+        """Receive the requests of a `request` stream. `receive` must only enqueue."""
+        key = stream.key(self.run, ident)
+
+        def on_query(query: zenoh.Query) -> None:
+            receive(Request(stream, query))
+
+        self._declared.append(self._session.declare_queryable(key, on_query, complete=True))
 
     def publish(self, stream: Stream, message: Message, ident: str = "main") -> None:
         """Publish to a `latest` stream. Never blocks; what nobody receives is lost by design."""

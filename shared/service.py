@@ -15,7 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TypeVar
 
-from shared.bus import Bus, Inbox
+from shared.bus import Bus
 from shared.config import Config
 from shared.errors import (
     BusError,
@@ -25,6 +25,7 @@ from shared.errors import (
     RouterMissing,
     StateError,
 )
+from shared.inbox import Inbox
 from shared.keys import SERVICE
 from shared.messages import PROTOCOL_VERSION, ServiceCommand, ServiceReply
 

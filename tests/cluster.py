@@ -16,8 +16,9 @@ from waiting import wait_until
 
 from services import processes
 from shared import settings
-from shared.bus import Bus, Inbox
+from shared.bus import Bus
 from shared.config import Config
+from shared.inbox import Inbox
 from shared.keys import LEARNER_STATE, REPLAY_STATE
 from shared.messages import LearnerState, Message, ReplayState
 

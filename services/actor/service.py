@@ -12,8 +12,8 @@ import numpy as np
 from services.actor.courier import Courier
 from services.actor.session import Newest, Session
 from services.actor.targets import Targets
-from shared.bus import Inbox
 from shared.config import Config, Numerics
+from shared.inbox import Inbox
 from shared.keys import ACTOR_STATE, LEARNER_STATE, OBSERVATION
 from shared.messages import (
     LearnerState,

@@ -11,10 +11,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from services.processes import ACTOR, DRIVER, MAIN
-from shared.bus import Bus, Inbox
+from shared.bus import Bus
 from shared.config import Config
 from shared.errors import ConfigError, PeerMissing, RobotTaken
 from shared.facts import ACTION_COUNT, NAME
+from shared.inbox import Inbox
 from shared.keys import ACTION, OBSERVATION, Peer
 from shared.messages import PROTOCOL_VERSION, Action, Motion, Observation
 from shared.service import TICK_S, Service, StopFlag, answer_signals, controlled, new_life

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import numpy as np
+
+from shared import columns
 from shared.bus import Bus
-from shared.changes import apply
 from shared.errors import PeerSilent
 from shared.keys import CHANGES, SNAPSHOT
 from shared.messages import Change, ChangesRequest, FeedEnd, SnapshotRequest
-from shared.rl.memory import SampleStore
+from shared.rl.memory import MIRROR, SampleStore
 
 TRANSFER_TIMEOUT_S = 60.0
 
@@ -77,3 +79,21 @@ def _check_complete(end: FeedEnd, rows: int, messages: int) -> None:
             f"transfer incomplete: expected {end.rows} rows in {end.messages} parts, "
             f"got {rows} in {messages}"
         )
+
+
+def apply(samples: SampleStore, part: Change) -> None:
+    """Apply one part of a change to a store of samples.
+
+    Raises KeyError or ValueError when it does not fit the samples.
+    """
+    values = columns.CHANGES[part.kind].decode(part)
+    if part.kind == "discard":
+        samples.remove(values["ids"])
+    elif part.kind == "rewards":
+        samples.set_rewards(values["ids"], values["rewards"])
+    else:
+        rows = np.zeros(len(values["ids"]), MIRROR)
+        rows["id"], rows["action"], rows["reward"] = (
+            values[name] for name in ("ids", "actions", "rewards")
+        )
+        samples.append(rows, values["images"])

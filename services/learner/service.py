@@ -10,9 +10,9 @@ import numpy as np
 
 from services.learner import checkpoint
 from services.learner.mirror import Mirror
-from shared.bus import Inbox
 from shared.config import Config
 from shared.errors import StateError
+from shared.inbox import Inbox
 from shared.keys import LEARNER_STATE, REPLAY_STATE, TURNS, WEIGHTS
 from shared.messages import LearnerState, ReplayState, Turn, Turns, TurnsRequest
 from shared.metrics import MetricsLog

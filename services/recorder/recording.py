@@ -22,7 +22,7 @@ from typing import BinaryIO, Self
 
 from mcap.writer import CompressionType, Writer
 
-from shared.bus import Heard
+from services.recorder.tap import Heard
 from shared.config import ActorNumerics, Config
 from shared.errors import ConfigError
 from shared.keys import STREAMS, Stream

@@ -10,6 +10,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from services.recorder.recording import RECORDED, Origin, RecordingWriter
+from services.recorder.tap import Tap
 from shared.config import ActorNumerics, Config
 from shared.errors import ConfigError, StateError
 from shared.service import EXIT_CRASH, TICK_S, Service, Stopped, service
@@ -78,7 +79,7 @@ class Recorder:
         self, me: Service, writer: RecordingWriter, limit: int, echo: Callable[[str], None]
     ) -> None:
         self._me, self._writer, self._limit, self._echo = me, writer, limit, echo
-        self._tap = me.bus.tap(RECORDED)
+        self._tap = Tap(me.bus, RECORDED)
         self._fetcher = WeightsFetcher(me, self._tap.wake)
         me.stop.on_set(self._tap.wake)
         self._version = self._versions = self._skipped = 0

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from services.replay.tables import REWARDS, Position, Tables, Txn, key_of, number_of, pack, unpack
-from shared.changes import change
+from shared.columns import CHANGES
 from shared.messages import Change, FeedEnd
 
 PART_ROWS = 256
@@ -98,10 +98,10 @@ class Feed:
             first, count = what
             yield from self._appended(txn, number, list(range(first, first + count)), current=False)
         elif kind == "discard":
-            yield change(number, True, "discard", ids=np.frombuffer(what, "<u8"))
+            yield _change(number, True, "discard", ids=np.frombuffer(what, "<u8"))
         else:
             column = np.frombuffer(what, REWARDS)
-            yield change(number, True, "rewards", ids=column["id"], rewards=column["reward"])
+            yield _change(number, True, "rewards", ids=column["id"], rewards=column["reward"])
 
     def _appended(
         self, txn: Txn, number: int, ids: list[int], *, current: bool
@@ -116,7 +116,7 @@ class Feed:
         rows, images = self._tables.rows(txn, ids)
         if current:
             self._tables.overlay_rewards(txn, rows)
-        return change(
+        return _change(
             number,
             last,
             "append",
@@ -125,3 +125,8 @@ class Feed:
             actions=rows["action"],
             rewards=rows["reward"],
         )
+
+
+def _change(number: int, last: bool, kind: Kind, **values: Any) -> Change:
+    """Return a part of change `number` with the arrays that its kind has (`columns.CHANGES`)."""
+    return Change(number=number, last=last, kind=kind, **CHANGES[kind].encode(values))

@@ -15,8 +15,9 @@ from services.replay.footprint import gather_heap
 from services.replay.numbering import Counters, filling, progress_of
 from services.replay.storage import Storage
 from services.replay.worker import TurnWorker
-from shared.bus import Inbox, Request
+from shared.bus import Request
 from shared.config import Config
+from shared.inbox import Inbox
 from shared.keys import (
     CHANGES,
     EPISODE,

@@ -13,9 +13,9 @@ from services.robot_driver.kinds import make_robot
 from services.robot_driver.motion_control import SLICE_S
 from services.robot_driver.robot import NotReady
 from shared import statefile
-from shared.bus import Inbox
 from shared.config import Config
 from shared.errors import StateError
+from shared.inbox import Inbox
 from shared.keys import ACTION, OBSERVATION, ROBOT_COMMAND, ROBOT_STATE, ROBOT_WORLD
 from shared.messages import Action, Observation, RobotCommand, WorldChange
 from shared.service import TICK_S, Service, Stopped, new_life, service

@@ -11,8 +11,8 @@ from comparison import assert_equal, distributed, single_process
 from waiting import wait_until
 
 from services.cli import main as cli
-from shared.bus import Inbox
 from shared.config import Config
+from shared.inbox import Inbox
 from shared.keys import OBSERVATION, ROBOT_STATE, ROBOT_WORLD
 from shared.messages import Box, Observation, RobotState, WorldChange, WorldChanged
 

@@ -22,7 +22,7 @@ from services.recorder import playback
 from services.recorder.reader import MAX_RECORD_BYTES, Recording
 from services.recorder.recording import Origin, RecordingWriter
 from services.recorder.service import actor_numerics
-from shared.bus import Heard
+from services.recorder.tap import Heard
 from shared.codec import encode
 from shared.config import ActorNumerics, Config
 from shared.errors import ConfigError, StateError

@@ -15,10 +15,9 @@ from builders import FakePredictor, fake_values, make_episode
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.learner.mirror import Mirror
+from services.learner.mirror import Mirror, apply
 from services.replay import feed as feed_module
 from services.replay.storage import Storage
-from shared.changes import apply
 from shared.config import MemoryConfig
 from shared.errors import PeerSilent, StateError
 from shared.keys import CHANGES

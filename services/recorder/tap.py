@@ -1,0 +1,74 @@
+"""Every message of `latest` streams, in the order of arrival, for one thread that keeps up."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from shared.bus import Bus
+from shared.keys import Stream
+
+MAX_MESSAGES, MAX_BYTES = 20_000, 64 * 1024 * 1024
+"""Most that waits at a tap."""
+
+
+@dataclass(frozen=True)
+class Heard:
+    """A published message as it came: nothing of it is checked but its size and its key."""
+
+    stream: Stream
+    ident: str
+    """Of the sender, from the key."""
+    time_ns: int
+    """When it arrived, by the clock of this computer since 1970."""
+    data: bytes
+
+
+class Tap:
+    """Hears these streams of a run from now on.
+
+    At most `MAX_MESSAGES` of them and `MAX_BYTES` wait; what comes beyond that is lost and counted.
+    """
+
+    def __init__(self, bus: Bus, streams: Sequence[Stream]) -> None:
+        self._ready = threading.Condition()
+        self._waiting: deque[Heard] = deque()
+        self._bytes = 0
+        self._woken = False
+        self.lost: Counter[str] = Counter()
+        """Messages not taken, by stream: too many waiting, oversized or badly addressed."""
+        for stream in streams:
+            self._listen(bus, stream)
+
+    def _listen(self, bus: Bus, stream: Stream) -> None:
+        def keep(ident: str | None, data: bytes) -> None:
+            with self._ready:
+                size = len(data)
+                room = len(self._waiting) < MAX_MESSAGES and self._bytes + size <= MAX_BYTES
+                if ident is None or not room:
+                    self.lost[stream.name] += 1
+                    return
+                self._waiting.append(Heard(stream, ident, time.time_ns(), data))
+                self._bytes += size
+                self._ready.notify_all()
+
+        bus.subscribe(stream, "*", keep)
+
+    def take(self, timeout_s: float) -> list[Heard]:
+        """All that waits, as soon as there is something; empty at the timeout or when woken."""
+        with self._ready:
+            self._ready.wait_for(lambda: bool(self._waiting) or self._woken, timeout_s)
+            self._woken = False
+            taken = list(self._waiting)
+            self._waiting.clear()
+            self._bytes = 0
+            return taken
+
+    def wake(self) -> None:
+        """Let `take` return (any thread)."""
+        with self._ready:
+            self._woken = True
+            self._ready.notify_all()
