@@ -46,9 +46,9 @@ class RunConfig(Section):
     """Which run this is."""
 
     name: Name = "demo"
-    """First chunk of every Zenoh key, so that two runs never mix."""
+    """First part of every Zenoh key, so that two runs never mix."""
     seed: int = Field(default=1, ge=0, lt=2**63)
-    """The only seed: every random draw is a function of it, a role and a position."""
+    """The only seed. Every random number is a function of it, a role and a position."""
     episodes: int = Field(default=0, ge=0)
     """Stop the run after this many counted episodes; 0 runs until stopped."""
 
@@ -57,13 +57,13 @@ class BusConfig(Section):
     """How services reach the Zenoh router."""
 
     endpoint: str = Field(default="tcp/127.0.0.1:7447", pattern=r"^[a-z][a-z0-9-]*/\S+$")
-    """Where clients connect, and where our own router listens (loopback unless told otherwise)."""
+    """Where clients connect, and where our own router listens."""
     lease_ms: int = Field(default=2000, ge=200, le=60000)
     """A frozen or cut-off service counts as gone after this time."""
     request_timeout_s: float = Field(default=5.0, gt=0.0, le=120.0)
-    """One attempt of a request; it is repeated until answered."""
+    """Time for one attempt of a request, which is repeated until it is answered."""
     shared_memory: bool = True
-    """Large messages between services of one machine go through shared memory where they can."""
+    """Large messages between services of one machine go through shared memory if possible."""
     heartbeat_s: float = Field(default=1.0, gt=0.0, le=10.0)
     """Period of status messages; three missed ones count as silence."""
 
@@ -81,18 +81,18 @@ class CameraConfig(Section):
 
 
 class HardwareConfig(Section):
-    """A real robot, whatever its kind: how fresh readings must be, how often commands are sent."""
+    """Any real robot: how fresh readings must be, how often commands are sent."""
 
     command_period_s: float = Field(default=0.1, gt=0.01, le=0.5)
-    """The velocity in force is sent again this often: below the robot's own watchdog."""
+    """The velocity is sent again after this time. It must be below the robot's own watchdog."""
     camera_stale_s: float = Field(default=1.0, gt=0.0, le=5.0)
     """The robot stands still while its newest picture is older."""
     odometry_stale_s: float = Field(default=0.5, gt=0.0, le=5.0)
     """The robot stands still while its newest odometry is older."""
     bumper_stale_s: float = Field(default=0.5, gt=0.0, le=5.0)
-    """The robot stands still while its newest bumper reading is older: silence is no all-clear."""
+    """The robot stands still while its newest bumper reading is older."""
     rest_s: float = Field(default=0.7, ge=0.0, le=5.0)
-    """After a recovery: until a robot that was told to stop stands still, its delay included."""
+    """Time that the robot needs to come to rest after a recovery, its delay included."""
     open_timeout_s: float = Field(default=10.0, gt=0.0, le=120.0)
     """The service ends when robot and sensors have not all answered by then."""
 
@@ -107,10 +107,10 @@ class RobotinoConfig(Section):
     """Host, or host:port."""
     camera_period_s: float = Field(default=0.1, gt=0.0, le=1.0)
     sensor_period_s: float = Field(default=0.1, gt=0.0, le=1.0)
-    """Of bumper and odometry."""
+    """Period of bumper and odometry."""
     battery_period_s: float = Field(default=5.0, gt=0.0, le=60.0)
     timeout_s: float = Field(default=0.25, gt=0.0, le=5.0)
-    """Of one request, and of one command."""
+    """Timeout of one request or command."""
 
 
 TOPIC = r"^[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*$"
@@ -127,23 +127,23 @@ class Ros2Config(Section):
     """The bridge, or the router of rmw_zenoh, on the robot."""
     transport: Literal["bridge", "rmw-zenoh"] = "bridge"
     domain: int = Field(default=0, ge=0, le=232)
-    """ROS_DOMAIN_ID; rmw-zenoh only."""
+    """ROS_DOMAIN_ID, for rmw-zenoh only."""
     distribution: Literal["humble", "jazzy"] = "jazzy"
-    """Humble has no type hashes in its keys; rmw-zenoh only."""
+    """Humble has no type hashes in its keys. For rmw-zenoh only."""
     namespace: str = Field(default="", pattern=OPTIONAL_TOPIC)
-    """Before every topic, without a leading slash."""
+    """It is put before every topic, without a leading slash."""
     velocity_topic: str = Field(default="cmd_vel", pattern=TOPIC)
     velocity_type: Literal["auto", "Twist", "TwistStamped"] = "auto"
-    """auto: what the network says the robot listens for."""
+    """auto: the type that the robot listens for, as the network tells."""
     odometry_topic: str = Field(default="odom", pattern=TOPIC)
     camera_topic: str = Field(default="image_raw", pattern=TOPIC)
     camera_type: Literal["Image", "CompressedImage"] = "Image"
     bumper_topic: str = Field(default="bumper", pattern=TOPIC)
     bumper_type: Literal["Bool", "HazardDetectionVector"] = "Bool"
     bumper_on_change: bool = False
-    """The robot publishes its bumper on change only: odometry then shows that it still talks."""
+    """The bumper is published on change only. Odometry then shows that the robot is alive."""
     battery_topic: str = Field(default="", pattern=OPTIONAL_TOPIC)
-    """Empty: none."""
+    """Empty: the robot has none."""
     battery_type: Literal["BatteryState", "PowerReadings"] = "BatteryState"
 
 
@@ -152,9 +152,9 @@ class RobotConfig(Section):
 
     id: Name = "robotino1"
     kind: Literal["sim", "robotino", "ros2"] = "sim"
-    """The PyBullet simulation, or a real robot: its section below says how to reach it."""
+    """The PyBullet simulation, or a real robot, which a section below says how to reach."""
     timing: Literal["lockstep", "realtime"] = "lockstep"
-    """lockstep: simulated time stands still until the action has come; realtime: fixed period."""
+    """lockstep: simulated time waits for each action; realtime: the period is fixed."""
     world: Name = "plus"
     period_s: float = Field(default=0.25, gt=0.01, le=2.0)
     """Time one action lasts."""
@@ -163,19 +163,19 @@ class RobotConfig(Section):
     turn_rad_s: float = Field(default=math.radians(80.0), gt=0.0, le=3.0)
     """Turn rate of the actions that turn fully (A21, E31)."""
     max_speed_m_s: float = Field(default=0.8, gt=0.0, le=2.0)
-    """Clamp: commands are cut to it."""
+    """Commands are cut to it."""
     max_turn_rad_s: float = Field(default=1.5, gt=0.0, le=3.0)
-    """Clamp: commands are cut to it."""
+    """Commands are cut to it."""
     deadman_s: float = Field(default=0.6, gt=0.0, le=10.0)
-    """Without a fresh action for this long the robot stops (simulated time in lockstep)."""
+    """The robot stops if no fresh action came for this long (simulated time in lockstep)."""
     resend_s: float = Field(default=0.5, gt=0.0, le=10.0)
     """Lockstep: an unanswered observation is sent again after this wall-clock time."""
     recovery: Literal["back-off", "none"] = "back-off"
-    """What the driver does after a bump (E11); `none` is the literal variant."""
+    """What the driver does after a bump (E11). `none` follows the thesis literally."""
     recovery_distance_m: float = Field(default=0.5, gt=0.0, le=1.0)
     recovery_speed_m_s: float = Field(default=0.2, gt=0.0, le=0.5)
     radius_m: float = Field(default=0.225, gt=0.0, le=1.0)
-    """Round shell with the ring bumper."""
+    """Radius of the round shell with the bumper."""
     camera: CameraConfig = CameraConfig()
     hardware: HardwareConfig = HardwareConfig()
     robotino: RobotinoConfig = RobotinoConfig()
@@ -215,7 +215,7 @@ class EpisodeConfig(Section):
     max_samples: int = Field(default=500, ge=2, le=5000)
     """An episode ends at a bump or at this many unprocessed samples."""
     horizon: int = Field(default=50, ge=1, le=500)
-    """Look-ahead of the reward; as many samples are carried over when no bump came."""
+    """Actions that the reward looks ahead. As many samples are carried over without a bump."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -240,7 +240,7 @@ class PolicyConfig(Section):
 
     kind: Literal["eps-greedy", "roulette", "eps-greedy-roulette"] = "eps-greedy-roulette"
     epsilon: Probability = 0.1
-    """E3: 0.1 (10 %)."""
+    """Probability of a choice by chance or roulette (E3)."""
     temperature: float = Field(default=0.01, gt=0.0, le=100.0)
 
 
@@ -248,42 +248,42 @@ class NetworkConfig(Section):
     """Shape of the Q network (A23, E16)."""
 
     filters: int = Field(default=64, ge=4, le=256)
-    """Per convolution; 64 in the thesis. RMM needs a divisor or a multiple of 16 (A29)."""
+    """Filters of each convolution. RMM needs a divisor or a multiple of 16 (A29)."""
     layout: Literal["ccpccp", "cpcccp"] = "ccpccp"
-    """Order of the four convolutions and two pools: both end in 9x15 maps (E16)."""
+    """Order of the four convolutions and two pools. Both orders end in 9x15 maps (E16)."""
 
 
 class MemoryConfig(Section):
     """Replay memory: capacity, what is discarded, what is refreshed (A27-A35)."""
 
     capacity: int = Field(default=45000, ge=30, le=5_000_000)
-    """N, to begin with."""
+    """The capacity N at the start."""
     capacity_max: int = Field(default=0, ge=0, le=5_000_000)
     """N grows up to this when a search finds too few candidates; 0: never (A44, E32)."""
     capacity_step: int = Field(default=0, ge=0, le=5_000_000)
-    """By how much it grows at a time; 0: 5000, scaled with `capacity` (A44, E17b)."""
+    """By how much N grows at a time; 0: 5000, scaled with `capacity` (A44, E17b)."""
     fill: Literal["random", "policy", "none"] = "random"
     """How the memory is filled before the first episode (A13, E9)."""
     strategy: StrategyName = "rmm"
-    """Which samples go when the memory is full (A28-A34)."""
+    """Which samples are discarded when the memory is full (A28-A34)."""
     rule: Literal["paper", "cover"] = "paper"
-    """Marking against any newer sample, or only against kept ones (E23)."""
+    """Whether a sample is compared with all newer ones or only with kept ones (E23)."""
     threshold_percent: int = Field(default=1, ge=1, le=100)
-    """Similarity threshold at the start, % of 120 bits (A32, E18); 100: all are similar."""
+    """Similarity threshold at the start, in % of 120 bits (A32, E18). 100: all are similar."""
     threshold_max_percent: int = Field(default=7, ge=1, le=100)
     recompute_below: int = Field(default=0, ge=0)
-    """Fewer candidates of an over-quota action call for new marks; 0: 1000 scaled (A31, E17b)."""
+    """Fewer candidates of an action above its share cause a search; 0: 1000, scaled (A31, E17b)."""
     raise_at_most: int = Field(default=0, ge=0)
-    """No more candidates than this raise capacity or threshold; 0: 2000 scaled (A32, E17b)."""
+    """A search that finds no more raises capacity or threshold; 0: 2000, scaled (A32, E17b)."""
     mark_all_at_episode: int = Field(default=0, ge=0)
-    """At this global episode all samples stored before are marked by decree, until they are
+    """At this global episode all samples stored before become candidates until they are
     discarded; 0: never (A44)."""
     equalise_every: int = Field(default=50, ge=0)
-    """Episodes between reward equalisations; 0 never (A35)."""
+    """Episodes between reward equalisations; 0: never (A35)."""
     equalise_keep: Probability = 0.7
     """Eq 3.5: r <- keep r + (1 - keep) Q."""
     protect_terminal: bool = False
-    """E24: leave the -1 of terminal samples alone."""
+    """Leave the -1 of terminal samples unchanged (E24)."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -315,17 +315,17 @@ class LearningConfig(Section):
     rmsprop_epsilon: float = Field(default=1e-6, gt=0.0, le=1.0)
     """E30."""
     fit_every: int = Field(default=100, ge=0)
-    """Episodes between fitting phases; 0 never."""
+    """Episodes between fitting phases; 0: never."""
     fit_epochs: int = Field(default=3, ge=1, le=1000)
     augmentation: Literal["none", "mirror"] = "none"
-    """mirror: half of all samples, by chance, train mirrored, left for right: what is learnt in
-    one direction of a corridor then helps in the other."""
+    """mirror: half of all samples, by chance, are mirrored for training, left and right
+    exchanged. What is learnt in one direction of a corridor then helps in the other."""
     target_rule: Literal["bump", "episode"] = "episode"
-    """Copy train to target after episodes with a bump (paper, A26) or after every one (E15)."""
+    """Copy train to target after episodes with a bump (thesis, A26) or after every one (E15)."""
     target_average: bool = False
-    """Copy not the newest weights but the mean of those after each step of the last epoch of a
-    fitting phase, or of the episode's mini-batches: it drives more steadily than any of them. With
-    target_rule 'episode' only."""
+    """Copy the mean of the weights after each step of a fitting phase's last epoch, or of the
+    episode's mini-batches. It drives more steadily than the newest weights. With target_rule
+    'episode' only."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -338,24 +338,24 @@ class LearningConfig(Section):
 
 
 class Numerics(Section):
-    """Arithmetic of one role. It is part of the configuration: equal settings, equal bits."""
+    """Arithmetic of one role. Equal settings give equal bits."""
 
     device: Literal["cpu", "cuda", "auto"] = "cpu"
-    """auto: a GPU where there is one, found when the run first starts, then fixed in its folder."""
+    """auto: a GPU if there is one, found when the run first starts, then fixed in its folder."""
     engine: Literal["torch", "openvino", "auto"] = "torch"
-    """What predicts on a CPU; auto: the faster one of those installed, measured when the run first
-    starts, then fixed in its folder. Training is always torch's."""
+    """What predicts on a CPU. auto: the faster installed one, measured when the run first starts,
+    then fixed in its folder. Training always uses torch."""
     threads: int = Field(default=1, ge=0, le=256)
     """0: chosen when the run first starts, then fixed in its folder."""
     precision: Literal["float32", "bfloat16", "auto"] = "float32"
-    """bfloat16: the convolutions when predicting, their backward pass when training (the forward
-    pass does not stand it); auto: what is faster here, measured when the run first starts, then
-    fixed in its folder."""
+    """bfloat16: for convolutions when predicting, and for their backward pass when training (it is
+    too inexact for the forward pass). auto: the faster one, measured when the run first starts,
+    then fixed in its folder."""
     batch: int = Field(default=32, ge=1, le=4096)
-    """Images per pass; torch pads to it when predicting, so that results do not depend on company.
-    Those of openvino do not anyway: it takes passes as large as they come, up to 32."""
+    """Images per pass. When predicting, torch pads to it, so that results do not depend on how
+    many images there are. Those of openvino never do: it takes passes of any size up to 32."""
     cuda_batch: int = Field(default=2048, ge=1, le=65536)
-    """Images per pass where the device is a GPU."""
+    """Images per pass on a GPU."""
 
     @property
     def settled(self) -> bool:
@@ -374,15 +374,15 @@ class ActorNumerics(Numerics):
     batch: int = Field(default=1, ge=1, le=4096)
     """Observations per pass."""
     cuda_batch: int = Field(default=1, ge=1, le=65536)
-    """Observations per pass where the device is a GPU."""
+    """Observations per pass on a GPU."""
 
 
 class LearnerNumerics(Numerics):
-    """Training: a mini-batch is shared among the threads, each taking its share in parts."""
+    """Training: each thread takes a share of the mini-batch, and computes it in parts."""
 
     engine: Literal["torch"] = "torch"
     batch: int = Field(default=8, ge=1, le=4096)
-    """Images per part: small ones stay in the processor's caches."""
+    """Images per part. Small parts stay in the processor's caches."""
 
 
 class NumericsConfig(Section):

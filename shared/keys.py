@@ -4,10 +4,10 @@ Keys start with the run name, then the sender (`<run>/robot/<robot>/observation`
 never mix and allow-lists per role stay short. `docs/protocol.md` is checked against this table by
 a test. There are two kinds of delivery and no third:
 
-latest   published; the receiver holds one message per key, a newer one replaces an unread older
-         one. A lost message is repaired by the next heartbeat or by sending again.
-request  asked for and answered; the asker repeats until answered or its deadline is over. The
-         server's queue is bounded; what does not fit is answered with the error "busy".
+latest   published. The receiver holds one message per key, and a newer one replaces an unread
+         older one. The next heartbeat or a repetition replaces a lost message.
+request  the sender repeats it until it is answered or its deadline is over. The receiver's queue
+         is bounded; what does not fit is answered with the error "busy".
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def ident_in(stream: Stream, key: str) -> str | None:
 
 
 NEWEST = "newer replaces unread older"
-BUSY = "error reply 'busy', the asker repeats"
+BUSY = "error reply 'busy', the sender repeats it"
 
 
 def _latest(
@@ -127,7 +127,7 @@ PROGRESS      = _request("progress",      "{run}/replay/main/progress",   m.Prog
 TURNS         = _request("turns",         "{run}/replay/main/turns",      m.TurnsRequest,     (m.Turns,),            "learner",               "replay",        "one per turn",             1 * KIB,  16)
 CHANGES       = _request("changes",       "{run}/replay/main/changes",    m.ChangesRequest,   (m.Change, m.FeedEnd), "learner",               "replay",        "one per turn",             1 * KIB,  4)
 SNAPSHOT      = _request("snapshot",      "{run}/replay/main/snapshot",   m.SnapshotRequest,  (m.Change, m.FeedEnd), "learner",               "replay",        "at start and after a gap", 1 * KIB,  4)
-MINI_BATCH    = _request("mini_batch",    "{run}/replay/main/mini_batch", m.MiniBatchRequest, (m.Change,),           "a foreign learner",     "replay",        "as it likes",              1 * KIB,  4)
+MINI_BATCH    = _request("mini_batch",    "{run}/replay/main/mini_batch", m.MiniBatchRequest, (m.Change,),           "a foreign learner",     "replay",        "any",                      1 * KIB,  4)
 WEIGHTS       = _request("weights",       "{run}/learner/main/weights",   m.WeightsRequest,   (m.Weights,),          "actor, replay, anyone", "learner",       "one per version",          1 * KIB,  16)
 SERVICE       = _request("service",       "{run}/service/{id}/command",   m.ServiceCommand,   (m.ServiceReply,),     "anyone",                "every service", "rare",                     1 * KIB,  16)
 

@@ -67,7 +67,7 @@ def image_array(image: bytes) -> ImageArray:
 
 
 class Observation(Message):
-    """What the robot perceives after action `sequence - 1`, and where it waits for the next.
+    """What the robot perceives after action `sequence - 1`, while it waits for the next.
 
     Driver to actor and monitor. In lockstep it is sent again until answered.
     """
@@ -75,22 +75,22 @@ class Observation(Message):
     robot: Ident
     life: Life
     sequence: Count
-    """Grows by one per executed action; the action that answers it carries the same number."""
+    """Grows by one per executed action. The action that answers it has the same number."""
     attempt: Count = 0
-    """Fresh looks at the same sequence: after a hold, a late action or an interruption."""
+    """Counts fresh observations of one sequence: after a hold, a late action or an interruption."""
     image: Image
     x_m: float
     y_m: float
     heading_rad: float
     bump: bool
-    """Contact at any time during the last action (E11); a recovery, if any, is already done."""
+    """Contact at any time during the last action (E11). A recovery, if any, is over."""
     interruption: Interruption = ""
     world: Ident
     period_s: Annotated[float, Field(gt=0.0)]
     stamp_s: float
     """Simulated time in lockstep, the driver's monotonic clock in realtime."""
     laps_left: Count = 0
-    """Laps completed anticlockwise since the life began, where the world has a lap line."""
+    """Laps completed anticlockwise since the life began; 0 in worlds without laps."""
     laps_right: Count = 0
     """Laps completed clockwise."""
 
@@ -102,28 +102,28 @@ class Action(Message):
     actor_life: Life
     robot_life: Life
     sequence: Count
-    """Of the observation answered; the driver ignores any other than the one it waits on."""
+    """That of the observation answered. The driver ignores an answer to any other."""
     attempt: Count = 0
-    """Of the observation answered."""
+    """That of the observation answered."""
     action: Annotated[int, Field(ge=0, lt=ACTION_COUNT)] | None = Field(
         description=", ".join(f"{number} {action.name}" for number, action in enumerate(ACTIONS))
         + " (A21); None: hold still for one period."
     )
     motion: Motion = ""
-    """Instead of an action, which is None then: move like this for one period. A driver that cannot
-    holds still. It counts as no action: `sequence` stays, and the next observation says "moved"."""
+    """Move like this for one period. `action` is None then. A driver that cannot do it holds still.
+    It counts as no action: `sequence` stays, and the next observation says "moved"."""
     greedy: bool
     values: ActionValues
     """Clipped predictions Q(s, a) of all actions, for the monitor."""
     weights_version: Count
     episode: Count = 0
-    """Counted episodes of the robot so far, as far as the actor knows; 0 while the memory fills.
-    Changes of the world wait for it (`WorldChange.at_episode`)."""
+    """Counted episodes of the robot so far; 0 while the memory fills. Changes of the world wait for
+    it (`WorldChange.at_episode`)."""
     filling: bool = False
-    """Chosen to fill the memory (A13)."""
+    """The action was chosen to fill the memory (A13)."""
     fills: Count = 0
-    """Fill submissions of the robot so far. With seed, policy and values, `step` and, by `filling`,
-    this or `episode` decide the choice: anyone can repeat it."""
+    """Fill submissions of the robot so far. Anyone can repeat the choice, which depends on seed,
+    policy, values, `step`, and on this if `filling`, else on `episode`."""
     step: Count = 0
     """Steps in the robot's open episode before this one."""
 
@@ -135,7 +135,7 @@ class Action(Message):
 
 
 class RobotCommand(Message):
-    """Operator's wish to the driver, acknowledged by `RobotState`. Anyone to driver."""
+    """An operator's command, acknowledged by `RobotState`. Anyone to driver."""
 
     command: Literal["estop", "clear", "pause", "resume"]
 
@@ -154,7 +154,7 @@ class RobotState(Message):
     robot: Ident
     life: Life
     state: Literal["waiting", "driving", "recovering", "blocked", "paused", "estop", "stopped"]
-    """blocked: a real robot is not fit to drive; it goes on by itself once it is."""
+    """blocked: a real robot is not fit to drive. It goes on by itself once it is."""
     sequence: Count
     x_m: float
     y_m: float
@@ -183,11 +183,11 @@ class RobotState(Message):
 
 
 class Box(Message):
-    """A box standing on the floor of a simulated world; metres and degrees."""
+    """A box on the floor of a simulated world, in metres and degrees."""
 
     name: Ident
     x_m: float
-    """Of its middle."""
+    """Place of its middle."""
     y_m: float
     heading_deg: float = 0.0
     """Direction along which `length_m` is measured."""
@@ -199,17 +199,17 @@ class Box(Message):
 
 
 class WorldChange(Message):
-    """A wish to change a simulated robot's world. Anyone to driver, answered by `WorldChanged`.
+    """A change of a simulated robot's world. Anyone to driver, answered by `WorldChanged`.
 
-    Exactly what its kind needs is set: `world` (and `start`), `box`, or `name`.
+    Only what its kind needs is set: `world` (and `start`), `box`, or `name`.
     """
 
     id: Annotated[str, Field(pattern=r"^([0-9a-f]{12})?$")] = ""
-    """Drawn by the sender: a wish sent again under the same id is carried out once. Empty: each
-    one counts."""
+    """Drawn by the sender. A change that is sent again with the same id is carried out once. If
+    empty, each one counts."""
     kind: Literal["switch", "place", "remove"]
     at_episode: Count = 0
-    """Carried out instead of the first action whose `Action.episode` is at least this; 0: now."""
+    """Carried out in place of the first action whose `Action.episode` is at least this; 0: now."""
     world: Ident | None = None
     """switch: the world that the robot drives in from then on."""
     start: Few = 0
@@ -233,13 +233,13 @@ class WorldChanged(Message):
     """What became of a `WorldChange`, and the world as it is now. Driver to anyone."""
 
     accepted: bool
-    """Carried out, or kept until its episode."""
+    """The change was carried out, or is kept until its episode."""
     reason: str = ""
     """Why it was refused; empty if accepted."""
     world: str
-    """The robot's world; empty where it cannot be changed."""
+    """The robot's world; empty if it cannot be changed."""
     obstacles: tuple[Ident, ...]
-    """Names of what stands there."""
+    """Names of its obstacles."""
     pending: Count
     """Changes that wait for their episode."""
 
@@ -248,23 +248,23 @@ class WorldChanged(Message):
 
 
 class Episode(Message):
-    """The samples one episode releases, asking to be stored.
+    """The samples of one episode, to be stored.
 
-    Actor to replay, answered by `EpisodeAck`. Identity is (robot, life, number): the same one is
-    stored once, however often it is sent.
+    Actor to replay, answered by `EpisodeAck`. Its identity is (robot, life, number). It is stored
+    once, however often it is sent.
     """
 
     robot: Ident
     life: Life
-    """Of the actor process that gathered it."""
+    """Life of the actor process that gathered it."""
     number: Count
     """Counts this actor life's submissions for this robot from 0."""
     fill: bool
-    """Gathered to fill the memory: not counted as an episode (E9)."""
+    """Gathered to fill the memory, and not counted as an episode (E9)."""
     ended: Literal["bump", "full", "interrupted"]
     bump: bool
     weights_version: Count
-    """Target network that predicted the rewards; replay uses it or a newer one for this turn."""
+    """Version that predicted the rewards. Replay uses it or a newer one for this turn."""
     fitness: Few
     """Actions without a bump including carried-over ones, at most 500 (A37, E10)."""
     actions: Few
@@ -274,7 +274,7 @@ class Episode(Message):
     dropped_episodes: Few
     """Open episodes lost with an actor or driver since the previous submission."""
     worlds: Annotated[tuple[Ident, ...], Field(min_length=1, max_length=64)]
-    """Names that `sample_worlds` points into."""
+    """The names that `sample_worlds` refers to."""
     images: bytes
     """uint8 [n, 50, 75]."""
     sample_actions: bytes
@@ -293,7 +293,7 @@ class Episode(Message):
     """float32 [n, 3]: x_m, y_m, heading_rad at each sample."""
     robot_life: Life
     last_sequence: Count
-    """Driver sequence of the newest action whose sample is released or counted as dropped."""
+    """Driver sequence of the newest action whose sample is in here or counted as dropped."""
     laps_left: Few = 0
     laps_right: Few = 0
     """Laps completed while the samples were gathered."""
@@ -337,22 +337,22 @@ class EpisodeAck(Message):
     """Why it was refused for good; empty if accepted."""
     duplicate: bool = False
     commit: Count = 0
-    """Number of the submission among all, fill ones included."""
+    """Number of the submission among all, those of the fill included."""
     episode: Count = 0
-    """The global episode number e; for fill submissions that of the latest counted one."""
+    """The global episode number; for fill submissions that of the latest counted episode."""
     stored: Count = 0
-    """Samples stored: all, but for the last fill submission, which is cut at the capacity (A13)."""
+    """Samples stored. Only the last fill submission is cut at the capacity (A13)."""
     progress: RobotProgress | None = None
 
 
 class ProgressRequest(Message):
-    """Where was this robot? Actor to replay, answered by `RobotProgress`."""
+    """Asks where this robot was. Actor to replay, answered by `RobotProgress`."""
 
     robot: Ident
 
 
 class RobotProgress(Message):
-    """What replay has on disk, as far as one robot's next episode depends on it."""
+    """What one robot's next episode must know of the stored ones. Replay to actor."""
 
     robot: Ident
     filling: bool
@@ -374,14 +374,14 @@ class RobotProgress(Message):
 
 
 class Told(Message):
-    """One number that a strategy of retention tells of itself."""
+    """One number that a retention strategy reports."""
 
     name: str
     value: Count
 
 
 class ReplayState(Message):
-    """Heartbeat of replay: newest numbers only, everything else is pulled. Replay to all."""
+    """Heartbeat of replay with its newest numbers. Replay to all."""
 
     id: Ident
     life: Life
@@ -391,7 +391,7 @@ class ReplayState(Message):
     episode: Count
     """Newest counted episode committed to disk."""
     turn: Count
-    """Newest episode whose discard and equalisation are done: the learner may train on it."""
+    """Newest episode whose discard and equalisation are done. The learner may train on it."""
     turn_change: Count
     """Change number the learner must reach before training on `turn`."""
     size: Count
@@ -399,7 +399,7 @@ class ReplayState(Message):
     filling: bool
     by_action: Annotated[tuple[Count, ...], Field(min_length=ACTION_COUNT, max_length=ACTION_COUNT)]
     retention: Annotated[tuple[Told, ...], Field(max_length=64)] = ()
-    """What the strategy of retention tells of itself."""
+    """What the retention strategy reports."""
     weights_version: Count
     activity: Literal["idle", "committing", "descriptors", "equalising", "discarding", "waiting"]
     progress: Fraction = 1.0
@@ -416,7 +416,7 @@ class ReplayState(Message):
 
 
 class TurnsRequest(Message):
-    """Which episodes are ready for training after episode `since`? Learner to replay."""
+    """Asks which episodes after `since` are ready for training. Learner to replay."""
 
     since: Count
     limit: Annotated[int, Field(ge=1, le=1000)] = 100
@@ -439,21 +439,21 @@ class Turns(Message):
 
 
 class ChangesRequest(Message):
-    """Bring me from change `since` to change `upto`. Learner to replay; many replies."""
+    """Asks for the changes after `since` up to `upto`. Learner to replay, many replies."""
 
     since: Count
     upto: Count
 
 
 class SnapshotRequest(Message):
-    """The whole memory as of the newest turn. Learner to replay; many replies."""
+    """Asks for the whole memory as of the newest turn. Learner to replay, many replies."""
 
 
 class Change(Message):
     """One numbered change of the memory, or a part of one, in the order it was applied."""
 
     number: Count
-    """Change number; parts of one change share it and come in order."""
+    """Change number. Parts of one change share it and come in order."""
     last: bool
     """Final part of this change."""
     kind: Literal["append", "discard", "rewards"]
@@ -483,12 +483,12 @@ class Change(Message):
 
 
 class FeedEnd(Message):
-    """Last reply to `ChangesRequest` and `SnapshotRequest`; without it the transfer broke."""
+    """Last reply to `ChangesRequest` and `SnapshotRequest`. Without it the transfer broke."""
 
     change: Count
-    """The mirror now stands at exactly this change."""
+    """The mirror now has exactly the changes up to this one."""
     rows: Count
-    """Rows sent before, over all parts: to be compared with what arrived."""
+    """Rows sent before, over all parts, to be compared with what arrived."""
     messages: Count
     """Parts sent before."""
     gone: bool = False
@@ -496,11 +496,11 @@ class FeedEnd(Message):
 
 
 class MiniBatchRequest(Message):
-    """A mini-batch for learners that keep no mirror (third parties); one `Change` comes back."""
+    """Asks for a mini-batch, for foreign learners without a mirror. One `Change` comes back."""
 
     size: Annotated[int, Field(ge=1, le=4096)]
     key: Count
-    """Same key and same memory: same mini-batch."""
+    """The same key gives the same mini-batch of the same memory."""
 
 
 # ---------------------------------------------------------------- learner -> actor, replay
@@ -512,7 +512,7 @@ class LearnerState(Message):
     id: Ident
     life: Life
     episode: Count
-    """Newest turn done: trained, target rule applied, checkpoint on disk."""
+    """Newest finished turn: trained, target rule applied, checkpoint on disk."""
     weights_version: Count
     """Newest target version; fetch it by `WeightsRequest`."""
     weights_hash: Hash
@@ -532,11 +532,11 @@ class LearnerState(Message):
 
 
 class WeightsRequest(Message):
-    """The newest target network, please. Actor, replay, anyone to learner."""
+    """Asks for the newest target network. Actor, replay, anyone to learner."""
 
 
 class Weights(Message):
-    """One version of the target network. Learner's answer; about 1 MB a part."""
+    """One version of the target network, in parts of about 1 MB. The learner's answer."""
 
     version: Count
     hash: Hash
