@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import socket
-import subprocess
 import threading
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from forked import Forked
 from waiting import wait_until
 
 from services import processes
@@ -26,11 +27,21 @@ SERVICES = tuple(process.name for process in processes.SERVICES)
 ALL = tuple(process.name for process in processes.PROCESSES)
 
 
+WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+_ports = itertools.count(20_000 + 1000 * WORKER)
+"""Below the ports that the system gives to clients, and other ones for each worker."""
+
+
 def free_port() -> int:
     """A port nobody uses now; the router of a cluster must keep its port over restarts."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    for port in _ports:
+        with socket.socket() as probe:
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return port
+    raise AssertionError("unreachable")
 
 
 def make_config(run_name: str, **sections: dict[str, object]) -> Config:
@@ -60,7 +71,7 @@ class Cluster:
         self.config, self.folder = config, folder
         self._file = folder.parent / f"{folder.name}.toml"
         settings.write(config, self._file)
-        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._processes: dict[str, Forked] = {}
         self._bus: Bus | None = None
         self._inbox: Inbox | None = None
         self._newest: dict[type[Message], Message] = {}
@@ -94,26 +105,16 @@ class Cluster:
 
     def _launch(self, name: str, service: str, *options: str) -> None:
         self._forget(name)
-        command = [*processes.COMMAND, service, *options]
-        environment = {k: v for k, v in os.environ.items() if not k.startswith("CORRIDOR_")}
         self.folder.mkdir(parents=True, exist_ok=True)
-        with (self.folder / f"{name}.out").open("ab") as output:
-            self._processes[name] = subprocess.Popen(
-                [*command, "--config", str(self._file), "--tethered"],
-                stdin=subprocess.PIPE,
-                stdout=output,
-                stderr=output,
-                env=environment,
-                start_new_session=True,
-            )
+        words = [service, *options, "--config", str(self._file), "--tethered"]
+        self._processes[name] = Forked(words, self.folder / f"{name}.out")
 
     def _forget(self, name: str) -> None:
         process = self._processes.pop(name, None)
         if process is not None:
             process.kill()
             process.wait(10)
-            assert process.stdin is not None
-            process.stdin.close()
+            process.close()
 
     def kill(self, *names: str) -> None:
         """kill -9."""
