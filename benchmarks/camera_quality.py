@@ -44,7 +44,7 @@ HEIGHTS = {75: 50, 150: 100}
 FITNESS_OF_LAST = 100
 """Episodes, as everywhere fitness is shown."""
 SECTIONS = ("robot", "episode", "reward", "policy", "network", "memory", "learning")
-"""Of the configuration: what a run is the outcome of."""
+"""Sections of the configuration that decide the outcome of a run."""
 Run = dict[str, Any]
 """What one learning run gave: settings, commit, seconds, learning, driving."""
 DRIVING = {
@@ -74,7 +74,7 @@ class Plan:
     filters: int = 16
     capacity: int = 3000
     max_samples: int = 200
-    """Of an episode: shorter ones, so that robots that do not bump learn as often."""
+    """Samples of an episode: fewer, so that robots that do not bump learn as often."""
     fit_every: int = 10
     mini_batches: int = 4
     actions: int = 25_000
@@ -252,7 +252,7 @@ def runs_table(runs: Sequence[Run], random: Figures) -> str:
 
 
 def summary_table(runs: Sequence[Run]) -> str:
-    """Each figure's mean with its span at either size, and the difference of the means."""
+    """Return a table of each figure's mean and span at both sizes, with the difference."""
     sizes = list(dict.fromkeys(map(name_of, runs)))
     rows: list[list[object]] = []
     heads = {("driving", name): text for name, text in DRIVING.items()}

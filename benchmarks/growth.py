@@ -42,11 +42,11 @@ class Times:
     """Median seconds at one size."""
 
     passed_s: float
-    """Of a whole RMM pass, descriptors being known."""
+    """Time of a whole RMM pass with known descriptors."""
     append_s: float
-    """Of an append of one episode to a full memory."""
+    """Time to append one episode to a full memory."""
     both_s: float
-    """Of the append and the discard after it, marks being known."""
+    """Time of the append and the discard after it, with known marks."""
 
 
 def rows_of(first: int, count: int, draw: np.random.Generator) -> np.ndarray:

@@ -26,7 +26,7 @@ class Baseline:
         )  # fmt: skip
 
     def drive(self, steps: int) -> None:
-        """So many steps, with the training that falls due."""
+        """Drive this many steps, with the training that falls due."""
         torch.set_num_threads(self._threads)
         self.model.learn(steps, reset_num_timesteps=False)
 

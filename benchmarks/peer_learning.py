@@ -79,7 +79,7 @@ class Ours:
         self._actor.begin(self._progress(), self._observation)
 
     def drive(self, steps: int) -> None:
-        """So many steps, with the training that falls due."""
+        """Drive this many steps, with the training that falls due."""
         for _ in range(steps):
             submission = self._actor.finish(self._observation)
             if submission is not None:

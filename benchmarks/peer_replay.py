@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 MINI_BATCH_SIZE = 128
 WARM_UP = 5
 PAUSE_S = 0.03
-"""Before each insertion: what the other side still does with the one before is over then."""
+"""Pause before each insertion, so that the other side is done with the one before."""
 PEER = "torchrl"
 NOTE = (
     "Ours is on disk when acknowledged, with identity and provenance, and passes a router; "

@@ -39,7 +39,7 @@ from shared.weights import parts
 
 CHUNK_BYTES = 2 * 1024 * 1024
 LARGEST_BYTES = 4 * 1024 * 1024
-"""Of one message of gRPC: a chunk and what belongs to it."""
+"""Most bytes of one gRPC message: a chunk with its head."""
 SERVICE, METHOD = "corridor.Learner", "StreamWeights"
 FIRST, MIDDLE, LAST = b"\x01", b"\x02", b"\x03"
 PAUSE_S = 0.02

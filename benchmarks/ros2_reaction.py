@@ -72,7 +72,7 @@ def allowed_s(config: Config, name: str) -> float:
 
 
 def cases(rig: Ros2Rig) -> dict[str, Callable[[], float]]:
-    """Each fault: lets it happen, waits until the robot stands, mends it; how long it took."""
+    """Return a function for each fault, which returns the time until the robot stood."""
 
     def fault(changes: dict[str, object]) -> float:
         spent_s = rig.wait_still(rig.faults(**changes))

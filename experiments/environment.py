@@ -26,7 +26,7 @@ from shared.messages import Observation, image_array
 LIFE = "0" * 12
 """Life ids are random in the services; comparison ignores them."""
 MAX_EPISODE_STEPS = 500
-"""Of the registered environments: as long as an episode can be (A9)."""
+"""Longest episode of the registered environments, as in A9."""
 PICTURE_PX = 480, 270
 """Width and height of a rendered picture."""
 Image = npt.NDArray[np.uint8]

@@ -261,7 +261,7 @@ class MemoryConfig(Section):
     capacity_max: int = Field(default=0, ge=0, le=5_000_000)
     """N grows up to this when a search finds too few candidates; 0: never (A44, E32)."""
     capacity_step: int = Field(default=0, ge=0, le=5_000_000)
-    """By how much N grows at a time; 0: 5000, scaled with `capacity` (A44, E17b)."""
+    """How much N grows at a time; 0: 5000, scaled with `capacity` (A44, E17b)."""
     fill: Literal["random", "policy", "none"] = "random"
     """How the memory is filled before the first episode (A13, E9)."""
     strategy: StrategyName = "rmm"

@@ -19,7 +19,7 @@ class ActionKind(NamedTuple):
     """One of the robot's actions. Every action drives forward; some turn as well."""
 
     name: str
-    """For people and reports, such as "forward/left"."""
+    """Name for people and reports, such as "forward/left"."""
     short: str
     """One word for columns and narrow tables, such as "left". It is unique."""
     vector: tuple[float, ...]

@@ -102,9 +102,9 @@ class Action(Message):
     actor_life: Life
     robot_life: Life
     sequence: Count
-    """That of the observation answered. The driver ignores an answer to any other."""
+    """Number of the observation answered. The driver ignores an answer to any other."""
     attempt: Count = 0
-    """That of the observation answered."""
+    """Attempt of the observation answered."""
     action: Annotated[int, Field(ge=0, lt=ACTION_COUNT)] | None = Field(
         description=", ".join(f"{number} {action.name}" for number, action in enumerate(ACTIONS))
         + " (A21); None: hold still for one period."

@@ -152,7 +152,7 @@ class RunInfo(_Record):
     one_action_share: float = Field(default=0.0, ge=0.0, le=1.0)
     """Share of those that lasted a single action (E11)."""
     actions: int = 0
-    """So far, predecessors included."""
+    """Actions so far, with those of predecessors."""
     fill_actions: int = 0
     """Actions that filled the memory, counted likewise."""
     train_steps: int = 0

@@ -46,7 +46,7 @@ from shared.run_record import RunInfo, StageInfo, append_csv, made_here, now_utc
 from shared.statefile import write_atomically
 
 NAMES = {"progress": "dqn-progress", "distance": "dqn-distance"}
-"""Of the experiment, by its reward."""
+"""Name of the experiment, by its reward."""
 STAGE = "learn"
 REWARDS = tuple(NAMES)
 TARGET_EVERY = 1000
@@ -60,7 +60,7 @@ class Learner(Protocol):
     """What learns in the environment it was made with."""
 
     def drive(self, actions: int) -> None:
-        """So many more actions, with the training that falls due."""
+        """Drive this many more actions, with the training that falls due."""
 
     @property
     def actions(self) -> int:
@@ -142,7 +142,7 @@ class Dqn:
         self.drive(self._random)
 
     def drive(self, actions: int) -> None:
-        """So many more actions, with the training that falls due."""
+        """Drive this many more actions, with the training that falls due."""
         self._model.learn(actions, reset_num_timesteps=False)
 
     @property

@@ -21,7 +21,7 @@ from shared.messages import Observation, image_array
 from shared.rl.network import initialised
 
 HIDDEN = 128
-"""Of FConn1 and FConn3."""
+"""Units of FConn1 and FConn3."""
 
 
 class Trunk(BaseFeaturesExtractor):  # type: ignore[misc]

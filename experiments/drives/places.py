@@ -16,7 +16,7 @@ from shared.rl.draws import generator
 Floats = npt.NDArray[np.float64]
 
 SEED = 7
-"""Of starts and random actions: the same for whoever is tried."""
+"""Seed of starts and random actions, the same for every network."""
 CELL_M = 0.5
 """Edge of the cells that coverage counts."""
 GRID_M = 0.05

@@ -39,7 +39,7 @@ class Event:
 
     number: int
     action: int
-    """After so many actions."""
+    """Actions driven before it."""
     text: str
 
 

@@ -103,7 +103,7 @@ def distances_m(places_m: Floats, horizon: int) -> Floats:
 
 
 def circling(trace: Trace, horizon: int, max_distance_m: float) -> Bools:
-    """At which actions the robot circled; bool [n + 1 - horizon], none of shorter drives.
+    """Tell at which actions the robot circled: bool [n + 1 - horizon], empty for shorter drives.
 
     It circles if within the last `horizon` actions it turned by more than a full circle, net,
     without bumping, and is nearer to where it was before them than 20 % of the farthest possible.

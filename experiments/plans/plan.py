@@ -265,7 +265,7 @@ def _tree(names: tuple[str, ...], text: str, folder: Traversable) -> Tree:
 
 
 def _with_defaults(config: Tree) -> Tree:
-    """With the values that a smaller scale divides, where the plan leaves them at the default."""
+    """Add the values that a smaller scale divides where the plan leaves them at the default."""
     defaults = Config().to_dict()
     tables: Tree = {"learning": {}, "memory": {}}
     for section, key in (*SIZES, *PERIODS, ("learning", "mini_batches_per_episode")):

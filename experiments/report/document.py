@@ -64,7 +64,7 @@ class Section:
     """Blocks under a heading."""
 
     name: str
-    """For links and file names."""
+    """Name for links and files."""
     title: str
     blocks: tuple[Block, ...]
 

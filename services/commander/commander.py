@@ -40,7 +40,7 @@ class Commander:
 
     @property
     def bus(self) -> Bus:
-        """For requests beside the answers."""
+        """The bus, for requests beside the answers."""
         return self._me.bus
 
     @property

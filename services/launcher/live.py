@@ -43,7 +43,7 @@ class RunView:
     """0: no end in sight."""
     heartbeat_s: float = 1.0
     note: str = ""
-    """Such as "stopping"."""
+    """What the whole run does, such as "stopping"; empty while it drives."""
 
 
 # ---------------------------------------------------------------- words

@@ -25,7 +25,7 @@ from typing import IO, Literal, Self
 log = logging.getLogger(__name__)
 
 STAGE_ENDS_S = (0.8, 1.6, 3.4, 3.9)
-"""After a stop began: when to go on to the next stage at the latest; after the last one, kill."""
+"""When each stage of a stop is over at the latest. After the last one, what is left is killed."""
 FIRST_DELAY_S, LONGEST_DELAY_S = 0.25, 10.0
 STEADY_S = 30.0
 """A child that ran this long is restarted at once when it crashes."""

@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 TICK_S = 0.25
 PORTS = range(10000, 30000)
-"""Below what kernels hand out to outgoing connections: a restarted router finds its port free."""
+"""Kernels give none of these to outgoing connections, so a restarted router finds its port free."""
 
 
 def run_all(config: Config, folder: Path, *, listen: str | None, given: bool) -> int:

@@ -23,7 +23,7 @@ from shared.rl.predictor import Predictor
 from shared.rl.preprocess import PREPROCESS_VERSION, preprocess
 
 KEPT_OBSERVATIONS = 256
-"""Of all robots together; an action follows its observation closely."""
+"""Observations kept for all robots together. An action follows its observation closely."""
 KEPT_NETWORKS = 4
 Place = tuple[str, str, int, int]
 
@@ -35,9 +35,9 @@ class Comparison:
     equal: int = 0
     different: int = 0
     exact: int = 0
-    """Of the equal ones: the predictions, too, are the same bits."""
+    """Equal actions whose predictions are the same bits, too."""
     skipped: Counter[str] = field(default_factory=Counter)
-    """Not compared, by why."""
+    """Actions that were not compared, by reason."""
     first: str = ""
     """The first difference, in one line."""
 

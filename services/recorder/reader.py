@@ -54,7 +54,7 @@ class Weights:
 
     version: int
     offset: int
-    """Of its record."""
+    """Place of its record in the file, bytes."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from shared.service import EXIT_CRASH, TICK_S, Service, Stopped, service
 from shared.weights import WeightsFetcher
 
 FLUSH_S = 1.0
-"""So much is lost at most when the recorder is killed."""
+"""Period of writing to disk: a killed recorder loses no more than this."""
 TELL_S = 10.0
 MIB = 1024 * 1024
 

@@ -45,7 +45,7 @@ class View:
     activity: Activity = "idle"
     progress: float = 1.0
     fitness: tuple[int, ...] = field(default=())
-    """Of the last 100 counted episodes."""
+    """Fitness of the last 100 counted episodes."""
 
     @property
     def fitness_mean(self) -> float:

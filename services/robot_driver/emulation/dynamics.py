@@ -14,7 +14,7 @@ from typing import Protocol
 from services.robot_driver.robot import STANDSTILL, Pose, Velocity
 
 STEP_S = 0.02
-"""Of the base's own control loop: 50 Hz."""
+"""Period of the base's own control loop."""
 MAX_WAITING = 64
 """Commands on their way through the delay; more are dropped, oldest first."""
 MAX_REMEMBERED = 128
@@ -118,11 +118,11 @@ class EmulatedBase:
         self.body, self.dynamics = body, dynamics
         self.now_s = now_s
         self.velocity = STANDSTILL
-        """Of the wheels, now."""
+        """Velocity of the wheels now."""
         self.stalled = False
         """Fault: the motors do not turn, whatever is commanded."""
         self.sequence = 0
-        """Of the odometry: one more with each step."""
+        """Number of the odometry reading, one more with each step."""
         self.still_since_s: float | None = now_s
         """Since when the wheels stand; None while they turn."""
         self.watchdog_stops = 0

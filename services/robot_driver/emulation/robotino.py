@@ -38,7 +38,7 @@ SILENT_S = 10.0
 """Without a request for this long the camera is let go: the next one finds none."""
 MAX_BODY = 4096
 SPEED_LIMIT_M_S, TURN_LIMIT_RAD_S = 2.0, 3.0
-"""Beyond these the server refuses a command."""
+"""The server refuses commands beyond these."""
 FREE_M = 0.41
 """What distance sensors tell with nothing near; these ones never see anything."""
 Reply = tuple[int, str, bytes]

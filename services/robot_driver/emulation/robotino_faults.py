@@ -28,4 +28,4 @@ class Faults(FaultSet):
     post_ignored: bool = False
     """As old images do: POST is answered and does nothing, PUT works."""
     watchdog_s: float = Field(default=ROBOTINO.watchdog_s, gt=0.0, le=5.0)
-    """Of the base: 0.2 s as documented, 0.5 s as in older sources."""
+    """Time after which the base stops by itself: 0.2 s as documented, 0.5 s in older sources."""

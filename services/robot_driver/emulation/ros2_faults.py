@@ -13,7 +13,7 @@ from shared.errors import ConfigError
 from shared.foreign_bus import ForeignBus
 
 FAULTS_KEY, TRUTH_KEY = "emulator/faults", "emulator/truth"
-"""On the robot's network, for tests: faults, changed by a JSON object, and what it really does."""
+"""Keys for tests on the robot's network: faults as JSON, and what the robot really does."""
 
 
 class Ros2Faults(FaultSet):
@@ -38,9 +38,9 @@ class Ros2Faults(FaultSet):
     """rmw_zenoh: messages come without their attachment."""
     battery_low: bool = False
     closed_s: float = Field(default=0.0, ge=0.0, le=60.0)
-    """Leave the network for so long, then come back by itself."""
+    """Leave the network for this time, then come back."""
     watchdog_s: float = Field(default=CREATE3.watchdog_s, gt=0.0, le=5.0)
-    """Of the base."""
+    """Time after which the base stops by itself."""
 
 
 def change_faults(endpoint: str, items: list[str]) -> str:

@@ -47,7 +47,7 @@ class Gate:
         self._next_s = -math.inf
         self._zeros = 0
         self._still_s = -math.inf
-        """From then on the robot stands: it coasts for a while after a stop."""
+        """When the robot stands: it coasts for a while after a stop."""
 
     @property
     def stuck(self) -> bool:

@@ -31,7 +31,7 @@ from shared.config import RobotConfig
 TICK_S = 0.01
 """How often lease, sensors and bumper are looked at while the robot moves."""
 REFUSALS = 3
-"""So many commands in a row that did not get through are told as the robot's problem."""
+"""Failed commands in a row after which the robot counts as not fit to drive."""
 CLOSING_S = 3.0
 """Longest that `close` tries to send its stops."""
 T = TypeVar("T")

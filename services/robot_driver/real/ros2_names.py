@@ -35,9 +35,9 @@ class Endpoint:
 
     direction: Direction
     topic: str
-    """Without leading slash, namespace included."""
+    """Name without a leading slash, with its namespace."""
     type_name: str
-    """Such as `geometry_msgs/msg/Twist`."""
+    """Full name of its type, such as `geometry_msgs/msg/Twist`."""
 
 
 @dataclass(frozen=True)

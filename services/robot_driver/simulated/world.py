@@ -154,7 +154,7 @@ class World(Part):
             raise ValueError(f"{key}.height_m: higher than the wall ({self.height_m} m)")
 
     def _check_route(self, route: Route) -> None:
-        """On free space all the way; it may cross itself, and obstacles may be driven round."""
+        """Check that it lies on free space. It may cross itself and pass through obstacles."""
         places = {"route.points": route.sample(0.05)}
         for i, place in enumerate(route.places):
             places[f"route.places.{i}"] = np.array([[place.x_m, place.y_m]])

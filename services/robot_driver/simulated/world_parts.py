@@ -111,7 +111,7 @@ class Fixture(Part):
     """Height of its lower edge above the floor."""
     rgb: Colour
     style: DoorStyle | None = None
-    """Of a door; panelled unless given."""
+    """Style of a door, panelled unless given."""
     name: Text | None = None
     """Stands on the map instead of the kind."""
 
@@ -132,7 +132,7 @@ class Obstacle(Part):
 
     name: Text
     x_m: Coordinate
-    """Of its middle."""
+    """Place of its middle."""
     y_m: Coordinate
     heading_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
     """Direction along which `length_m` is measured."""
@@ -198,7 +198,7 @@ class Route(Part):
 
     @property
     def length_m(self) -> float:
-        """Of the line."""
+        """Length of the line."""
         steps = np.diff(np.array(self.points, np.float64), axis=0)
         return float(np.hypot(steps[:, 0], steps[:, 1]).sum())
 
