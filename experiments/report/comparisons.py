@@ -87,7 +87,8 @@ def _curves(company: Company, name: str, members: Sequence[Experiment]) -> list[
         what = f"frozen evaluation of {len(names)} experiments together"
         return [Missing(what, "there are too few colours to tell them apart")]
     caption = (
-        "Greedy drives without learning; bands: lowest to highest seed; thin lines: single seeds."
+        "Drives of frozen networks. Bands reach from the lowest to the highest seed. Thin lines "
+        "are single seeds."
     )
     return [
         Picture(
@@ -108,8 +109,9 @@ def _differences(
     blocks: list[Block] = []
     if pairs:
         caption = (
-            "Difference of mean bumps per 1,000 actions of the newest frozen drives; bootstrap "
-            "over seeds, 95 % interval, too narrow with few seeds. Filled: it excludes 0."
+            "Difference of mean bumps per 1,000 actions of the newest frozen drives. The 95 % "
+            "interval is a bootstrap over seeds and too narrow with few seeds. Filled marks: it "
+            "excludes 0."
         )
         title = "Differences between experiments"
         drawn = partial(drives.differences, pairs)

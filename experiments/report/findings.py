@@ -36,7 +36,7 @@ ENOUGH_SEEDS = 8
 
 
 def _verdict(same: bool) -> str:
-    return "as in the thesis" if same else "other than in the thesis"
+    return "as in the thesis" if same else "unlike in the thesis"
 
 
 def completeness(experiment: Experiment) -> list[str]:
@@ -88,8 +88,8 @@ def same_start(experiments: Sequence[Experiment]) -> list[str]:
                 fills.setdefault(run.info.seed, set()).add(run.info.prefill)
     differ = [str(seed) for seed, prefills in sorted(fills.items()) if len(prefills) > 1]
     if differ:
-        return [f"The memories did not begin equal in seed {', '.join(differ)}."]
-    return ["The memories of each seed began equal in all experiments."] if fills else []
+        return [f"In seed {', '.join(differ)} the memories were not equal at the beginning."]
+    return ["The memories of each seed were equal at the beginning."] if fills else []
 
 
 def loss(experiment: Experiment, shown: Presentation) -> list[str]:
@@ -100,8 +100,8 @@ def loss(experiment: Experiment, shown: Presentation) -> list[str]:
     before, after = (np.array(values) for values in zip(*sides, strict=True))
     ratio = float(np.median(after / before))
     fits = any(np.any(run.episodes.numbers("fitting") > 0) for run in experiment.runs)
-    when = "from before to after the first fitting phase" if fits else "from first to last"
-    told = f"The mean loss went {when} from {spread(before)} to {spread(after)}: it "
+    when = "From before to after the first fitting phase" if fits else "From first to last"
+    told = f"{when}, the mean loss went from {spread(before)} to {spread(after)}, so it "
     told += "fell" if ratio < 1.0 else "did not fall"
     if (falls := shown.expected.loss_falls) is not None:
         figure = shown.figures.get("loss")
@@ -138,8 +138,8 @@ def memory(experiment: Experiment, expected: Expected) -> list[str]:
     when = "At the end" if all(run.info.complete for run in experiment.runs) else "So far"
     seeds = f"{np.count_nonzero(spans <= BALANCED)} of {len(spans)} seeds"
     return [
-        f"{when} the memory held {told} (medians of the seeds). It was {word}{end}; it was "
-        f"balanced in {seeds}."
+        f"{when} the memory held {told} (medians of the seeds). It was {word}{end}. "
+        f"It was balanced in {seeds}."
     ]
 
 
@@ -176,21 +176,21 @@ def evaluation(experiment: Experiment, world: str) -> list[str]:
         of_seeds(experiment, evaluated(column, world))
         for column in ("laps", "distance", "coverage", "circling")
     )
-    told = f"Frozen in {world}: {spread(bumps)} bumps and {spread(laps)} laps per 1,000 actions, "
-    told += f"on average {spread(distance)} of the farthest possible from 50 actions ago, "
-    told += f"{spread(coverage)} of the corridor visited"
-    for driver in ("random", "planner"):
+    told = f"In {world} the frozen network had {spread(bumps)} bumps and {spread(laps)} laps per "
+    told += f"1,000 actions. On average it was {spread(distance)} of the farthest possible from "
+    told += f"where it was 50 actions ago. It visited {spread(coverage)} of the corridor."
+    for driver, name in (("random", "Random actions"), ("planner", "The planner")):
         other = of_seeds(experiment, evaluated("bumps_per_1000", world, driver))
         if len(other):
-            told += f"; {driver}: {number(float(np.median(other)))} bumps"
-    sentences = [told + "."]
+            told += f" {name} had {number(float(np.median(other)))} bumps."
+    sentences = [told]
     much = int(np.sum(circling > MUCH_CIRCLING))
     if much:
         sentences.append(
             f"Mind the circling in {world}: the robot circles {spread(100 * circling)} % of the "
             f"time, and {much} of {len(circling)} seeds circle more than "
             f"{100 * MUCH_CIRCLING:.0f} % of it. Few bumps or a high fitness do not mean that "
-            "these get anywhere."
+            "these seeds drive well."
         )
     return sentences
 
@@ -200,7 +200,7 @@ def difference(pair: Compared, better: str | None) -> str:
 
     Args:
         pair: The two experiments.
-        better: The one that the thesis holds for the better one, if it says so.
+        better: The one that the thesis found better, if it says so.
     """
     d = pair.difference
     fewer, other = (pair.ours, pair.theirs) if d.mean <= 0 else (pair.theirs, pair.ours)
@@ -211,13 +211,13 @@ def difference(pair: Compared, better: str | None) -> str:
     told += f" The interval of {pair.ours} − {pair.theirs} is {number(d.low)} to {number(d.high)} "
     told += f"({pair.seeds[0]} and {pair.seeds[1]} seeds)"
     few = min(pair.seeds) < ENOUGH_SEEDS
-    told += " and excludes 0." if d.sure else " and includes 0: it is undecided which is better."
+    told += " and excludes 0." if d.sure else " and includes 0, so it is undecided which is better."
     if d.sure and few:
-        told += " With so few seeds this is a hint only."
+        told += " With so few seeds this is only a hint."
     if better is not None:
-        told += f" The thesis holds {better} for the better one"
-        agrees = "so it is here" if better == fewer else "here it is not"
-        told += f"; {agrees}." if d.sure and not few else "."
+        told += f" The thesis found {better} better"
+        agrees = "and so it is here" if better == fewer else "but here it is not"
+        told += f", {agrees}." if d.sure and not few else "."
     return told
 
 
@@ -239,7 +239,7 @@ def tours(experiment: Experiment) -> list[str]:
         sentence = f"Seed {run.info.seed}: {passed} of {len(run.tours)} test drives were full and "
         sentence += "without a bump"
         sentence += f", {clean} more without a bump but not full" if clean else ""
-        told.append(f"{sentence}. The thesis tells of one drive, which was both.")
+        told.append(f"{sentence}. The thesis shows one drive, which was both.")
     return told
 
 
@@ -280,7 +280,7 @@ def continued(before: Experiment, after: Experiment, *, of_thesis: bool) -> list
     ends = [f", {_verdict(holds)}." if of_thesis else "." for holds in (rose, not fell)]
     return [
         f"The mean fitness went from {number(late)} (last quarter of {before.name}) to "
-        f"{number(middle)} ({after.name}): it {'rose' if rose else 'did not rise'}{ends[0]}",
+        f"{number(middle)} ({after.name}), so it {'rose' if rose else 'did not rise'}{ends[0]}",
         f"The curve {'collapsed at least once' if fell else 'never collapsed'}{ends[1]}",
     ]
 

@@ -73,7 +73,7 @@ def _absent(what: str, company: Company, names: Sequence[str]) -> list[Block]:
 
 def _continued(company: Company, ours: Experiment, named: Comparison) -> list[Block]:
     (earlier,) = named.others
-    what = _titled(f"Fitness of {earlier}, and of {ours.name}, which goes on from it", named)
+    what = _titled(f"Fitness of {earlier}, and of {ours.name}, which continues it", named)
     if blocks := _absent(what, company, (earlier, ours.name)):
         return blocks
     before = company.experiments[earlier]
@@ -91,8 +91,8 @@ def _fitness(company: Company, ours: Experiment, named: Comparison) -> list[Bloc
         return blocks
     together = [company.experiments[name] for name in names]
     caption = (
-        "Bands: lowest to highest seed. Episodes are counted from the first one of each run, also "
-        "where a run goes on from another."
+        "Bands reach from the lowest to the highest seed. Episodes are counted from the first of "
+        "each run, also if it continues another."
     )
     drawn = partial(progress.compared, together)
     picture = Picture(f"{ours.full_name}-fitness-compared", what, caption, drawn)

@@ -123,9 +123,9 @@ def _evaluations(experiment: Experiment, shown: Presentation) -> list[Block]:
     blocks: list[Block] = []
     for world in experiment.worlds:
         caption = (
-            f"Greedy drives of the frozen network in {world}, without learning. "
-            f"{_seeds_text(experiment)} Thin lines: single seeds. Lines across: random actions and "
-            "the planner that knows the map, where they drove."
+            f"Drives of the frozen network in {world}. "
+            f"{_seeds_text(experiment)} Thin lines are single seeds. Horizontal lines are random "
+            "actions and the planner that knows the map."
         )
         title = f"Frozen evaluation in {world}"
         drawn = partial(drives.curves, [experiment], world)

@@ -37,7 +37,7 @@ def test_memories_that_did_not_begin_equal_are_told(tmp_path: Path) -> None:
         write_run(tmp_path, name, 1, prefill="same")
         write_run(tmp_path, name, 2, prefill=fill)
     (section,) = compared(load([tmp_path]))
-    assert "The memories did not begin equal in seed 2." in sentences(section)
+    assert "In seed 2 the memories were not equal at the beginning." in sentences(section)
 
 
 def test_another_method_is_compared_at_its_scale(tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_comparisons_without_an_experiment_say_which(tmp_path: Path) -> None:
     assert "at least 2 seeds of each are needed" in why["difference of bumps"]
     (section,) = compared(some[1:])
     why = {block.what: block.why for block in section.blocks if isinstance(block, Missing)}
-    what = "Fitness of plus-normm, and of plus-normm-fit, which goes on from it (Fig 4.5)"
+    what = "Fitness of plus-normm, and of plus-normm-fit, which continues it (Fig 4.5)"
     assert "no runs of plus-normm at" in why[what]
     (section,) = compared([some[0], some[2]])
     assert "Predicted rewards in plus, plus-rmm and plus-normm (Fig 4.10)" in titles(section)
@@ -185,7 +185,7 @@ def test_a_plan_of_ones_own_is_compared_without_code(tmp_path: Path) -> None:
     )
     told = sentences(section)
     assert "The median of one is" in told
-    assert "The thesis holds one for the better one" in told
+    assert "The thesis found one better" in told
     assert "interval of two" not in told  # all are compared with the reference only
 
 

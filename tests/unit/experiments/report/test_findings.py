@@ -16,7 +16,7 @@ from experiments.report.statistics import Difference
     [
         (-3.0, -2.0, -1.0, ["plus-rmm had fewer", "excludes 0", "so it is here"]),
         (1.0, 2.0, 3.0, ["plus-normm had fewer", "excludes 0", "here it is not"]),
-        (-1.0, 0.5, 2.0, ["includes 0: it is undecided", "The thesis holds plus-rmm"]),
+        (-1.0, 0.5, 2.0, ["includes 0, so it is undecided", "The thesis found plus-rmm better"]),
         (-1.0, 0.0, 1.0, ["equally many"]),
     ],
 )
@@ -28,7 +28,7 @@ def test_a_difference_is_told_whichever_way_it_goes(
     for word in words:
         assert word in told
     few = findings.difference(replace(pair, seeds=(8, 3)), "plus-rmm")
-    assert ("a hint only" in few) == pair.difference.sure
+    assert ("only a hint" in few) == pair.difference.sure
     assert "The thesis" not in findings.difference(pair, None)
     assert "so it is here" not in few
     assert "here it is not" not in few

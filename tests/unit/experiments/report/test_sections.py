@@ -99,5 +99,5 @@ def test_a_route_names_its_events(tmp_path: Path) -> None:
     (found,) = load([tmp_path])
     shown = [b for b in shown_alone(found).blocks if isinstance(b, Picture)]
     assert shown[-1].title == "Route in plus (Fig 4.20)"
-    assert "2 actions, 1 bump, other than in the thesis." in shown[-1].caption
+    assert "2 actions, 1 bump, unlike in the thesis." in shown[-1].caption
     assert "1 (action 1) passes the window; 2 (action 2) turns." in shown[-1].caption
