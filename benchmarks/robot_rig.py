@@ -14,10 +14,11 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 import httpx
 
+from benchmarks.waiting import wait_until
 from shared import settings
 from shared.bus import Bus
 from shared.config import Config
@@ -26,21 +27,9 @@ from shared.keys import ROBOT_COMMAND, ROBOT_STATE
 from shared.messages import RobotCommand, RobotState
 from shared.provenance import ROOT
 
-T = TypeVar("T")
 LEFT = "1"
 PATIENCE_S = 90.0
-POLL_S = 0.02
 PARTS = ("forward_m_s", "left_m_s", "turn_rad_s")
-
-
-def wait_until(condition: Callable[[], T], what: str) -> T:
-    """The first true result of a condition. Raises AssertionError when none came in time."""
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not (result := condition()):
-        if time.monotonic() > deadline_s:
-            raise AssertionError(f"not within {PATIENCE_S} s: {what}")
-        time.sleep(POLL_S)
-    return result
 
 
 class Rig:
@@ -206,7 +195,7 @@ class Rig:
     def bus(self) -> Bus:
         """A client of the router."""
         if self._bus is None:
-            self._bus = wait_until(self._connect, "the router answers")
+            self._bus = wait_until(self._connect, PATIENCE_S, "the router answers")
             assert self._bus is not None
             self._inbox = self._bus.inbox()
             self._inbox.subscribe(ROBOT_STATE)
@@ -238,14 +227,14 @@ class Rig:
             except BusError:
                 return None
 
-        state = wait_until(asked, f"{name} acknowledged")
+        state = wait_until(asked, PATIENCE_S, f"{name} acknowledged")
         assert state is not None
         return state
 
     def wait(self, condition: Callable[[], Any], what: str) -> Any:
         """Wait with a deadline, and show what was known when it passes."""
         try:
-            return wait_until(condition, what)
+            return wait_until(condition, PATIENCE_S, what)
         except AssertionError as error:
             logs = "\n".join(f"--- {name}\n{self.log(name)}" for name in self._processes)
             raise AssertionError(f"{error}\n{self.state}\n{self.truth()}\n{logs}") from None

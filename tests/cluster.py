@@ -13,8 +13,8 @@ from types import TracebackType
 from typing import Self
 
 from forked import Forked
-from waiting import wait_until
 
+from benchmarks.waiting import wait_until
 from services import processes
 from shared import settings
 from shared.bus import Bus

@@ -9,7 +9,8 @@ import sys
 from collections.abc import Iterator
 
 import pytest
-from waiting import wait_until
+
+from benchmarks.waiting import wait_until
 
 __all__ = ["wait_until"]
 

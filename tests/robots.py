@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass
 
-from waiting import wait_until
-
+from benchmarks.waiting import wait_until
 from services.robot_driver.emulation.robotino import EmulatedRobotino, RobotinoServer
 from services.robot_driver.emulation.robotino_faults import Faults
 from services.robot_driver.emulation.ros2 import EmulatedRos2

@@ -11,8 +11,8 @@ import zenoh
 from builders import make_episode, make_observation
 from cluster import ALL, Cluster, make_config
 from fakes import message
-from waiting import wait_until
 
+from benchmarks.waiting import wait_until
 from shared.codec import encode
 from shared.keys import STREAMS, Stream
 from shared.messages import (

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from robots import SPEED_M_S, SUBJECTS, TURN_RAD_S, Subject
-from waiting import wait_until
 
+from benchmarks.waiting import wait_until
 from services.robot_driver.driver import Driver
 from services.robot_driver.host import Host
 from services.robot_driver.recovery import WatchedRobot, back_off

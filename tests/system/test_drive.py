@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from cluster import Cluster, free_port, make_config
 from safetensors.torch import load, save
-from waiting import wait_until
 
 from benchmarks.robot_rig import Rig
+from benchmarks.waiting import wait_until
 from shared.bus import Bus
 from shared.config import Config
 from shared.keys import OBSERVATION

@@ -10,8 +10,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from waiting import wait_until
 
+from benchmarks.waiting import wait_until
 from experiments.runs.schedule import shares_of
 
 pytestmark = pytest.mark.system

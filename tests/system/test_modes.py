@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 from cluster import ALL, Cluster, make_config
-from waiting import wait_until
 
+from benchmarks.waiting import wait_until
 from services.replay.storage import Storage
 from shared.keys import ACTOR_STATE, OBSERVATION, ROBOT_COMMAND, ROBOT_STATE
 from shared.messages import ActorState, Observation, RobotCommand, RobotState

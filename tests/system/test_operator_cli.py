@@ -9,8 +9,8 @@ from contextlib import ExitStack
 
 import pytest
 from fakes import answering, fake_service, message
-from waiting import wait_until
 
+from benchmarks.waiting import wait_until
 from services.cli import main as cli
 from shared.bus import Bus
 from shared.config import Config

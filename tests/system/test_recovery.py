@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 from cluster import ALL, Cluster, make_config
-from waiting import wait_until
 
+from benchmarks.waiting import wait_until
 from services.replay.storage import Storage
 from shared.keys import ACTOR_STATE
 from shared.messages import ActorState

@@ -11,8 +11,8 @@ from contextlib import closing
 import numpy as np
 import pytest
 from robots import BRIDGE, RMW_ZENOH, real_time, ros2_emulator
-from waiting import wait_until
 
+from benchmarks.waiting import wait_until
 from services.robot_driver.emulation.ros2_faults import Ros2Faults
 from services.robot_driver.real import cdr, ros2_names
 from services.robot_driver.real.ros2 import Ros2Link

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 from fakes import answering, message
-from waiting import wait_until
 
+from benchmarks.waiting import wait_until
 from shared.bus import Bus
 from shared.config import BusConfig
 from shared.errors import PeerMissing

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 from cluster import Cluster, make_config
-from waiting import wait_until
 
+from benchmarks.waiting import wait_until
 from shared.keys import OBSERVATION, ROBOT_STATE
 from shared.messages import Observation, RobotState
 

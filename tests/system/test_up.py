@@ -12,8 +12,8 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from waiting import wait_until
 
+from benchmarks.waiting import wait_until
 from experiments.report.run_folder import read_run
 
 pytestmark = pytest.mark.system

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from cluster import ALL, Cluster, make_config
 from comparison import assert_equal, distributed, single_process
-from waiting import wait_until
 
+from benchmarks.waiting import wait_until
 from services.cli import main as cli
 from shared.config import Config
 from shared.inbox import Inbox

@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 from fake_link import FakeLink, config_of
-from waiting import wait_until
 
+from benchmarks.waiting import wait_until
 from services.robot_driver import service
 from services.robot_driver.driver import Driver
 from services.robot_driver.host import Host

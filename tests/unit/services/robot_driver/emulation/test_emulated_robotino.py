@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import httpx
 import pytest
 from robots import robotino_server
-from waiting import wait_until
 
+from benchmarks.waiting import wait_until
 from services.robot_driver.emulation.robotino import RobotinoServer
 from services.robot_driver.emulation.robotino_faults import Faults
 from services.robot_driver.emulation.ros2_faults import Ros2Faults

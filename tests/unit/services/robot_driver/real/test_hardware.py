@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 from fake_link import FakeLink, config_of
-from waiting import wait_until
 
+from benchmarks.waiting import wait_until
 from services.robot_driver.driver import Driver
 from services.robot_driver.kinds import make_robot
 from services.robot_driver.motion_control import action_velocity

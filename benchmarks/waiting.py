@@ -13,7 +13,7 @@ POLL_S = 0.02
 def wait_until(
     condition: Callable[[], T], timeout_s: float, what: str, poll_s: float = POLL_S
 ) -> T:
-    """The first true result of `condition`; fails the test naming `what` when none came in time."""
+    """Return the first true result of `condition`. Raises AssertionError naming `what`."""
     deadline_s = time.monotonic() + timeout_s
     while True:
         result = condition()
