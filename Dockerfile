@@ -42,7 +42,7 @@ USER corridor
 WORKDIR /data
 ENTRYPOINT ["corridor"]
 HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
-    CMD ["python", "-m", "services.monitor.health", "router"]
+    CMD ["python", "-P", "-m", "services.monitor.health", "router"]
 CMD ["router", "--listen", "tcp/0.0.0.0:7447"]
 
 FROM base AS driver-sim
@@ -53,7 +53,7 @@ USER corridor
 WORKDIR /data
 ENTRYPOINT ["corridor"]
 HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
-    CMD ["python", "-m", "services.monitor.health", "driver"]
+    CMD ["python", "-P", "-m", "services.monitor.health", "driver"]
 CMD ["driver"]
 
 FROM base AS driver-robotino
@@ -64,7 +64,7 @@ USER corridor
 WORKDIR /data
 ENTRYPOINT ["corridor"]
 HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
-    CMD ["python", "-m", "services.monitor.health", "driver"]
+    CMD ["python", "-P", "-m", "services.monitor.health", "driver"]
 CMD ["driver"]
 
 FROM base AS driver-ros2
@@ -75,7 +75,7 @@ USER corridor
 WORKDIR /data
 ENTRYPOINT ["corridor"]
 HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
-    CMD ["python", "-m", "services.monitor.health", "driver"]
+    CMD ["python", "-P", "-m", "services.monitor.health", "driver"]
 CMD ["driver"]
 
 FROM base AS torch
@@ -94,7 +94,7 @@ USER corridor
 WORKDIR /data
 ENTRYPOINT ["corridor"]
 HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
-    CMD ["python", "-m", "services.monitor.health", "actor"]
+    CMD ["python", "-P", "-m", "services.monitor.health", "actor"]
 CMD ["actor"]
 
 FROM torch AS replay
@@ -105,7 +105,7 @@ USER corridor
 WORKDIR /data
 ENTRYPOINT ["corridor"]
 HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
-    CMD ["python", "-m", "services.monitor.health", "replay"]
+    CMD ["python", "-P", "-m", "services.monitor.health", "replay"]
 CMD ["replay"]
 
 FROM torch AS learner
@@ -116,5 +116,5 @@ USER corridor
 WORKDIR /data
 ENTRYPOINT ["corridor"]
 HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
-    CMD ["python", "-m", "services.monitor.health", "learner"]
+    CMD ["python", "-P", "-m", "services.monitor.health", "learner"]
 CMD ["learner"]

@@ -15,7 +15,7 @@ import time
 
 from services.monitor.heartbeats import Reader, Snapshot
 from services.monitor.words import learner_doing, replay_doing
-from services.processes import ACTOR, BY_NAME, ROUTER
+from services.processes import ACTOR, BY_NAME, DRIVER, LEARNER, REPLAY, ROUTER
 from shared import settings
 from shared.bus import Bus
 from shared.config import Config
@@ -71,15 +71,15 @@ def _doing(bus: Bus, name: str, config: Config) -> str:
 
 def _told(name: str, ident: str, seen: Snapshot) -> str:
     """What the service's heartbeat says; empty while there is none."""
-    if name == "driver" and ident in seen.robots:
+    if name == DRIVER.name and ident in seen.robots:
         robot = seen.robots[ident].message
         return f"{robot.state}, {robot.reason}" if robot.reason else robot.state
-    if name == "actor" and seen.actors:
+    if name == ACTOR.name and seen.actors:
         actors = (entry.message for entry in seen.actors.values())
         return ", ".join(f"{actor.phase} for {actor.robot}" for actor in actors)
-    if name == "replay" and seen.replay:
+    if name == REPLAY.name and seen.replay:
         return f"{replay_doing(seen.replay.message)}, episode {seen.replay.message.episode}"
-    if name == "learner" and seen.learner:
+    if name == LEARNER.name and seen.learner:
         return f"{learner_doing(seen.learner.message)}, episode {seen.learner.message.episode}"
     return ""
 

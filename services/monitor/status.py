@@ -21,6 +21,7 @@ from services.monitor.words import (
     replay_doing,
     retention,
 )
+from services.processes import ACTOR, DRIVER, LEARNER, REPLAY
 from shared.bus import Bus
 from shared.config import Config
 from shared.errors import BadMessage, BusError
@@ -175,9 +176,9 @@ def _ping(bus: Bus, peer: Peer) -> ServiceReply | None:
 def _complete(entries: Sequence[Entry], snapshot: Snapshot) -> bool:
     """Whether everybody who is there has told something."""
     told = {
-        "driver": bool(snapshot.robots),
-        "actor": bool(snapshot.actors),
-        "replay": snapshot.replay is not None,
-        "learner": snapshot.learner is not None,
+        DRIVER.name: bool(snapshot.robots),
+        ACTOR.name: bool(snapshot.actors),
+        REPLAY.name: snapshot.replay is not None,
+        LEARNER.name: snapshot.learner is not None,
     }
     return all(told.get(entry.peer.service, True) for entry in entries)

@@ -22,7 +22,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
-from tests.waiting import wait_until
+from benchmarks.waiting import wait_until
 
 T = TypeVar("T")
 ROOT = Path(__file__).parents[2]
