@@ -228,7 +228,7 @@ def follow(copy: Path, path: str, text: str) -> None:
 def run(arguments: list[str], copy: Path) -> None:
     """Run this Python in the copy, with the helpers of the tests at hand."""
     command = [sys.executable, *(["-m"] if arguments[0] == "ruff" else []), *arguments]
-    path = os.pathsep.join((str(copy), str(ROOT / "tests")))
+    path = os.pathsep.join((str(copy), str(ROOT / "tests"), str(ROOT)))
     environment = {**os.environ, "PYTHONPATH": path}
     done = subprocess.run(
         command, cwd=copy, env=environment, capture_output=True, text=True, check=False
