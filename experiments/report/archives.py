@@ -15,7 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from experiments.report import run_folder
-from experiments.report.run_folder import Experiment, Run
+from experiments.report.run_folder import Experiment, RunFolder
 from shared.errors import ConfigError, StateError
 
 SUFFIX = ".tar.xz"
@@ -66,7 +66,7 @@ def keep(runs: Sequence[Path], folder: Path, *, arrays: bool) -> None:
         path.write_bytes(data)
 
 
-def _small_files(run: Run, *, arrays: bool) -> dict[str, bytes]:
+def _small_files(run: RunFolder, *, arrays: bool) -> dict[str, bytes]:
     names = [name for name in TABLES if (run.folder / name).exists()]
     names += [path.name for path in sorted(run.folder.glob("*.npz"))] if arrays else []
     return {name: (run.folder / name).read_bytes() for name in names}

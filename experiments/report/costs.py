@@ -11,7 +11,7 @@ import numpy as np
 from experiments.plans.plan import PLANS, Plan, load_plan, plan_names, stage_config
 from experiments.report.document import Block, Missing, Table
 from experiments.report.measures import of_seeds
-from experiments.report.run_folder import Experiment, Run
+from experiments.report.run_folder import Experiment, RunFolder
 
 TITLE = "Cost of the full scale, a seed each"
 
@@ -47,7 +47,7 @@ def gradient_steps(plan: Plan) -> int:
     return total
 
 
-def rates(runs: Sequence[Run]) -> Rates | None:
+def rates(runs: Sequence[RunFolder]) -> Rates | None:
     """Seconds of an action and of a gradient step that tell the runs' seconds best.
 
     Least squares of the relative errors. None where the runs cannot tell the two apart.

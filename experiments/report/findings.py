@@ -23,7 +23,7 @@ from experiments.report.measures import (
     of_seeds,
     spread,
 )
-from experiments.report.run_folder import Experiment, Floats, Run
+from experiments.report.run_folder import Experiment, Floats, RunFolder
 from shared.facts import SHORT_NAMES
 
 BALANCED = 0.05
@@ -109,7 +109,7 @@ def loss(experiment: Experiment, shown: Presentation) -> list[str]:
     return [told + "."]
 
 
-def _loss_sides(run: Run) -> tuple[float, float] | None:
+def _loss_sides(run: RunFolder) -> tuple[float, float] | None:
     places, means = curve_of(run, "loss")
     fits = run.episodes.numbers("episode")[run.episodes.numbers("fitting") > 0]
     if not len(fits):
@@ -143,7 +143,7 @@ def memory(experiment: Experiment, expected: Expected) -> list[str]:
     ]
 
 
-def _share(action: str, run: Run) -> float:
+def _share(action: str, run: RunFolder) -> float:
     counts = {name: run.episodes.numbers(name)[-1:] for name in SHORT_NAMES}
     total = sum(float(values.sum()) for values in counts.values())
     return float(counts[action][0]) / total if total else float("nan")

@@ -11,7 +11,7 @@ import numpy as np
 
 from experiments.report.figures.drives import Compared, laps
 from experiments.report.figures.progress import curve_of
-from experiments.report.run_folder import Experiment, Floats, Rows, Run
+from experiments.report.run_folder import Experiment, Floats, Rows, RunFolder
 from experiments.report.statistics import bootstrap_difference
 from shared.rl.draws import generator
 from shared.run_record import RunInfo
@@ -25,7 +25,7 @@ class Measure:
     """A number of a run that the thesis tells as well."""
 
     text: str
-    of: Callable[[Run], float]
+    of: Callable[[RunFolder], float]
     scales: Literal["", "episodes", "memory"] = ""
     """What it grows with: the number of episodes, or the size of the memory."""
 
@@ -35,28 +35,28 @@ class Measure:
         return value / by[self.scales]
 
 
-def _highest(run: Run, column: str) -> float:
+def _highest(run: RunFolder, column: str) -> float:
     values = run.episodes.numbers(column)
     return float(np.nanmax(values)) if np.any(~np.isnan(values)) else MISSING
 
 
-def max_mean_fitness(run: Run) -> float:
+def max_mean_fitness(run: RunFolder) -> float:
     """Highest point of the fitness curve (A38)."""
     return float(np.max(curve_of(run, "fitness")[1], initial=-math.inf))
 
 
-def longest_run_episode(run: Run) -> float:
+def longest_run_episode(run: RunFolder) -> float:
     """Episode in which the longest way without a bump got its full length."""
     lengths = run.runs_without_bump
     return float(run.episodes.numbers("episode")[np.argmax(lengths)]) if len(lengths) else MISSING
 
 
-def longest_run(run: Run) -> float:
+def longest_run(run: RunFolder) -> float:
     """Most actions without a bump in the run's own episodes."""
     return float(np.max(run.runs_without_bump)) if len(run.episodes) else MISSING
 
 
-def actions_per_episode(run: Run) -> float:
+def actions_per_episode(run: RunFolder) -> float:
     """Mean of all episodes."""
     return run.actions / len(run.episodes) if len(run.episodes) else MISSING
 
@@ -80,21 +80,21 @@ MEASURED = {
 """What stands in `thesis` of run.json under these names is shown beside ours (E37)."""
 
 
-def of_seeds(experiment: Experiment, measure: Callable[[Run], float]) -> Floats:
+def of_seeds(experiment: Experiment, measure: Callable[[RunFolder], float]) -> Floats:
     """One number per seed, float64 [seeds], without those that have none."""
     values = np.array([measure(run) for run in experiment.runs], np.float64)
     return values[np.isfinite(values)]
 
 
-def newest(run: Run, world: str, driver: str = "network") -> Rows:
+def newest(run: RunFolder, world: str, driver: str = "network") -> Rows:
     """The last drive of a driver in a world, one row or none."""
     return Rows(run.evaluations.where(driver=driver, world=world).rows[-1:])
 
 
-def evaluated(column: str, world: str, driver: str = "network") -> Callable[[Run], float]:
+def evaluated(column: str, world: str, driver: str = "network") -> Callable[[RunFolder], float]:
     """A figure of the newest drive; `laps` counts both directions."""
 
-    def measure(run: Run) -> float:
+    def measure(run: RunFolder) -> float:
         rows = newest(run, world, driver)
         values = laps(rows) if column == "laps" else rows.numbers(column)
         return float(values[0]) if len(values) else MISSING
@@ -171,7 +171,9 @@ def at_equal_actions(
     return found
 
 
-def _with_before(run: Run, named: Mapping[str, Experiment], world: str) -> tuple[Floats, Floats]:
+def _with_before(
+    run: RunFolder, named: Mapping[str, Experiment], world: str
+) -> tuple[Floats, Floats]:
     """Actions driven while learning, and bumps of frozen drives, predecessors' first."""
     rows = run.evaluated(world)
     actions, bumps = rows.numbers("total_actions"), rows.numbers("bumps_per_1000")
@@ -208,7 +210,7 @@ class Kept:
         return self.after / self.before if self.before else MISSING
 
 
-def kept(run: Run, world: str, start: Run | None) -> Kept | None:
+def kept(run: RunFolder, world: str, start: RunFolder | None) -> Kept | None:
     """How much of one world is left after the stages in others that a run begins with.
 
     Args:

@@ -9,7 +9,7 @@ from experiments.plans.plan import PLANS
 from experiments.report import costs, tables
 from experiments.report.document import Section, Table
 from experiments.report.measures import evaluated, number, of_seeds, spread
-from experiments.report.run_folder import Experiment, Run
+from experiments.report.run_folder import Experiment, RunFolder
 
 MS_PER_H = 3.6e6
 DRIVEN = {
@@ -83,5 +83,5 @@ def _origin(experiment: Experiment, gpu_step_ms: float | None) -> tuple[str, ...
     )
 
 
-def _seed(run: Run) -> str:
+def _seed(run: RunFolder) -> str:
     return f"{run.info.seed}" if run.info.complete else f"{run.info.seed} (not complete)"

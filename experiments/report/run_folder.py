@@ -82,8 +82,8 @@ class Probes:
 
 
 @dataclass(frozen=True)
-class Run:
-    """One seed of an experiment."""
+class RunFolder:
+    """One seed of an experiment, as its folder holds it."""
 
     folder: Path
     info: RunInfo
@@ -165,7 +165,7 @@ class Run:
 class Experiment:
     """All seeds of one experiment at one scale, in order."""
 
-    runs: tuple[Run, ...]
+    runs: tuple[RunFolder, ...]
 
     @property
     def first(self) -> RunInfo:
@@ -204,7 +204,7 @@ def load(folders: Iterable[Path]) -> list[Experiment]:
         ConfigError: A folder holds no run, or two folders the same seed of an experiment.
         StateError: A file is damaged or not what it should be.
     """
-    groups: dict[tuple[str, str], dict[int, Run]] = {}
+    groups: dict[tuple[str, str], dict[int, RunFolder]] = {}
     for folder in _seed_folders(folders):
         run = read_run(folder)
         seeds = groups.setdefault((run.info.scale, run.info.experiment), {})
@@ -229,12 +229,12 @@ def _seed_folders(folders: Iterable[Path]) -> list[Path]:
     return list(found)
 
 
-def read_run(folder: Path) -> Run:
+def read_run(folder: Path) -> RunFolder:
     """Read one seed. Raises StateError naming the file that is not what it should be."""
     info, episodes = read_info(folder / RUN), _rows(lambda: read_episodes(folder))
     if info.scale == SERVICES:
         info = info.model_copy(update=_totals(episodes))
-    return Run(
+    return RunFolder(
         folder,
         info,
         episodes,

@@ -15,7 +15,7 @@ from experiments.report.measures import (
     of_seeds,
     spread,
 )
-from experiments.report.run_folder import Experiment, Run
+from experiments.report.run_folder import Experiment, RunFolder
 
 FIGURES = {
     "bumps_per_1000": "bumps per 1,000",
@@ -48,14 +48,14 @@ def frozen(experiment: Experiment, world: str) -> Table:
     return Table(name, title, ("", *lap, *FIGURES.values()), tuple(rows))
 
 
-def _first_lap(run: Run, timed: bool) -> tuple[str, ...]:
+def _first_lap(run: RunFolder, timed: bool) -> tuple[str, ...]:
     if not timed:
         return ()
     lap = run.info.first_lap
     return (number(lap["seconds"]), f"{lap['actions']:,.0f}") if lap else ("not yet", "not yet")
 
 
-def _figures(run: Run, world: str, driver: str) -> tuple[str, ...]:
+def _figures(run: RunFolder, world: str, driver: str) -> tuple[str, ...]:
     return tuple(number(evaluated(column, world, driver)(run)) for column in FIGURES)
 
 

@@ -1,4 +1,4 @@
-"""One run of a plan: stages, records, frozen evaluations and snapshots round the reference loop.
+"""One run of a plan: stages, records and snapshots round the reference loop.
 
 Everything a run writes is listed in `experiments.records` and `shared.run_record`. A run that is
 interrupted at any moment goes on from its last snapshot as if nothing had happened; what was
@@ -7,36 +7,28 @@ recorded after that snapshot is written again.
 
 from __future__ import annotations
 
-import json
-import shutil
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 
-from experiments.drives import routes
-from experiments.drives.references import DRIVERS
-from experiments.drives.traces import Figures
-from experiments.plans.plan import Plan, Scale, Stage, merged, stage_config
+from experiments.plans.plan import Plan, Scale, stage_config
 from experiments.records import EVALUATION_COLUMNS
-from experiments.runs import probes, snapshot
+from experiments.runs import snapshot, stages
 from experiments.runs.episode_row import episode_row, held, memory_hash
-from experiments.runs.observer import Observer
+from experiments.runs.evaluations import EVALUATIONS, Evaluations
+from experiments.runs.totals import Totals
 from experiments.single_process import SingleProcess, TurnDone
-from services.replay.numbering import bump_free
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import load_world
 from shared.config import Config
-from shared.errors import ConfigError, StateError
-from shared.messages import WorldChange
+from shared.errors import StateError
 from shared.numerics import Role, settle
 from shared.provenance import machine_key
 from shared.rl.network import to_bytes
-from shared.rl.retention.rmm import force_candidates
-from shared.rl.retention.strategy import begin
 from shared.run_record import (
     EPISODE_COLUMNS,
     EPISODES,
@@ -54,7 +46,6 @@ from shared.settings import claim
 from shared.statefile import write_atomically
 
 SNAPSHOT_EVERY_S = 60.0
-END = "state-end"
 
 
 @dataclass(frozen=True)
@@ -67,27 +58,6 @@ class Progress:
     actions: int
     fitness: float
     """Mean of the last episodes."""
-
-
-@dataclass
-class Totals:
-    """What the runner itself counts; saved with each snapshot."""
-
-    seconds: float = 0.0
-    """Wall time of driving and learning, evaluations not counted."""
-    evaluated_at: int = -1
-    """Actions at the last evaluation on the way."""
-    lap_checked_at: int = -1
-    first_lap: dict[str, float] = field(default_factory=dict)
-    run_actions: int = 0
-    """Actions since the newest bump or interruption, in this run."""
-    longest_run: int = 0
-    """Most actions without a bump, in this run (E10, E43)."""
-    prefill: str = ""
-    """Hash of the memory as the first episode began: equal for all that shared it."""
-    one_action_episodes: int = 0
-    """Counted episodes of this run that lasted a single action (E11)."""
-    stages: list[dict[str, Any]] = field(default_factory=list)
 
 
 class Run:
@@ -122,25 +92,27 @@ class Run:
         common = folder.parents[1] / "machines" / machine_key(first)
         roles = {role: settle(first, folder, role, common) for role in get_args(Role)}
         self._numerics = first.numerics.model_copy(update=roles)
-        self._loop = SingleProcess(self._config(0), self._robot(self._config(0).robot.world))
+        config = self._config(0)
+        robot = SimRobot(config.robot, load_world(config.robot.world), seed)
+        self._loop = SingleProcess(config, robot)
         self._totals = Totals()
         self._stage = 0
         self._offset = 0
         self._driving = self._best = b""
-        self._observer = Observer(self._config(0))
+        self._evaluations = Evaluations(plan, folder, config)
         self._fitness: list[int] = []
         self._restore(predecessor)
 
     @property
     def _stage_name(self) -> str:
         """Of the stage that goes on, or was the last; empty of a plan without any."""
-        stages = self.plan.stages
-        return stages[min(self._stage, len(stages) - 1)].name if stages else ""
+        index = min(self._stage, len(self.plan.stages) - 1)
+        return self.plan.stages[index].name if self.plan.stages else ""
 
     @property
     def complete(self) -> bool:
         """Whether the last stage is over and everything written."""
-        return snapshot.exists(self.folder / END)
+        return snapshot.exists(self.folder / snapshot.END)
 
     def go(self, report: Callable[[Progress], None], stopped: Callable[[], bool]) -> bool:
         """Run until the plan's end or until `stopped`; returns whether it is complete."""
@@ -170,7 +142,7 @@ class Run:
     def close(self) -> None:
         """Free the simulations."""
         self._loop.env.close()
-        self._observer.close()
+        self._evaluations.close()
 
     # ------------------------------------------------------------ stages
 
@@ -184,51 +156,14 @@ class Run:
             self._begin_stage()
         for done in self._loop.run():
             if done.commit.episode and not self._totals.prefill:
-                before = done.commit.first_id
-                self._totals.prefill = memory_hash(self._loop, before)
+                self._totals.prefill = memory_hash(self._loop, done.commit.first_id)
             yield done
 
     def _begin_stage(self) -> None:
-        stage = self.plan.stages[self._stage]
-        config = self._config(self._stage)
-        loop, episode = self._loop, self._loop.counters.episode
-        before = loop.config
-        loop.reconfigure(config)
-        if config.robot.world != loop.env.robot.world.name:
-            switch = WorldChange(kind="switch", world=config.robot.world, at_episode=episode)
-            self._change(switch)
-        for change in stage.changes:
-            at = self._offset + int(change["at_episode"])
-            self._change(WorldChange.model_validate({**change, "at_episode": at}))
-        if stage.force_candidates:
-            force_candidates(loop.memory, loop.memory.ids)
-        # Both change on the way: a stage sets them where it says something new.
+        stage, config = self.plan.stages[self._stage], self._config(self._stage)
         first = not self._totals.stages
-        named = merged(self.plan.config, stage.config).get("memory", {})
-        known, wanted = begin(before.memory), begin(config.memory)
-        loop.memory.kept |= {  # a first stage that names none keeps it (E45)
-            key: value
-            for key, value in wanted.items()
-            if (key in named if first else known[key] != value)
-        }
-        if first or before.memory.capacity != config.memory.capacity:
-            loop.memory.set_capacity(config.memory.capacity)
-        self._totals.stages.append(
-            {
-                "name": stage.name,
-                "world": config.robot.world,
-                "first_episode": episode + 1,
-                "first_action": loop.counters.actions,
-                "first_train_step": loop.trainer.train_steps,
-                "first_second": self._totals.seconds,
-            }
-        )
-
-    def _change(self, wish: WorldChange) -> None:
-        """Raises ConfigError when the driver refuses."""
-        answer = self._loop.env.driver.change(wish)
-        if not answer.accepted:
-            raise ConfigError(f"plan {self.plan.name}: {wish.kind}: {answer.reason}")
+        stages.enter(self._loop, self.plan, stage, config, self._offset, first=first)
+        self._totals.begin_stage(stage.name, config.robot.world, self._loop)
 
     def _advance(self, done: TurnDone) -> bool:
         """Evaluate and go on to the next stage where due; whether the plan is at its end."""
@@ -241,95 +176,31 @@ class Run:
         due = counters.actions // every > max(self._totals.evaluated_at, 0) // every
         if self._totals.evaluated_at < 0 or due or over:
             self._totals.evaluated_at = counters.actions
-            worlds = self.plan.evaluation.worlds if over else ()
-            self._evaluate(over, worlds or (self._loop.config.robot.world,))
+            self._show()
+            self._evaluations.drive(self._world, self._now(), over=over)
         if not over:
             return False
-        self._end_stage(stage)
+        self._totals.end_stage(self._loop)
+        self._show()
+        self._evaluations.take_pictures(stage.name, self._world)
         self._stage += 1
         if self._stage == len(self.plan.stages):
             return True
         self._begin_stage()
         return False
 
-    def _end_stage(self, stage: Stage) -> None:
-        counters, entry = self._loop.counters, self._totals.stages[-1]
-        entry["last_episode"] = counters.episode
-        entry["actions"] = counters.actions - entry.pop("first_action")
-        entry["train_steps"] = self._loop.trainer.train_steps - entry.pop("first_train_step")
-        entry["seconds"] = round(self._totals.seconds - entry.pop("first_second"), 1)
-        self._show()
-        self._take_pictures(stage.name)
-
-    def _take_pictures(self, label: str) -> None:
-        """What the network shown to the observer predicts, in all worlds of the plan."""
-        for world in sorted({self._loop.config.robot.world, *self.plan.evaluation.worlds}):
-            path = self.folder / f"probes-{label}-{world}.npz"
-            probes.save(path, self._observer.look(world))
-
     def _finish(self) -> None:
         data = to_bytes(self._loop.trainer.target_network)
         write_atomically(self.folder / "weights.safetensors", data)
         write_atomically(self.folder / "best.safetensors", self._best)
         if self.plan.tours:
-            self._drive_tours()
-        self._observer.show(self._best)  # of the longest bump-free run (Fig 4.7)
-        self._take_pictures("best")
-        self._refer()
+            self._show()
+            self._evaluations.drive_tours(self._world)
+        self._evaluations.show(self._best)  # of the longest bump-free run (Fig 4.7)
+        self._evaluations.take_pictures("best", self._world)
+        self._evaluations.drive_references(self._now())
         self._write_run(complete=True)
-        snapshot.save(self.folder / END, self._loop, self._extra())
-        for old in self.folder.glob("state-[0-9]*"):
-            shutil.rmtree(old)
-
-    # ------------------------------------------------------------ frozen drives
-
-    def _evaluate(self, over: bool, worlds: tuple[str, ...]) -> None:
-        """Drive frozen: thoroughly at the end of a stage, briefly on the way."""
-        settings, rows = self.plan.evaluation, []
-        label = f"stage {self._stage_name}" if over else "every"
-        starts = settings.starts if over else settings.every_starts
-        actions = settings.actions if over else settings.every_length
-        self._show()
-        for world in worlds:
-            figures = self._observer.evaluate(world, starts, actions)
-            rows.append(self._evaluation_row(label, "network", world, figures))
-        append_csv(self.folder / "evaluations.csv", EVALUATION_COLUMNS, rows)
-
-    def _drive_tours(self) -> None:
-        """Test drives with turns on the spot (A45): their routes, and `tours.json` about all."""
-        self._show()
-        told = []
-        world = self._loop.config.robot.world
-        tours = self._observer.tours(world, self.plan.tours, self.plan.tour_policy)
-        for number, tour in enumerate(tours):
-            routes.write(self.folder / f"route-tour-{number}.npz", tour.route)
-            told.append(tour.told.model_dump(mode="json"))
-        write_atomically(self.folder / "tours.json", (json.dumps(told, indent=2) + "\n").encode())
-
-    def _refer(self) -> None:
-        """Record floor and ceiling of all worlds that were driven in, at the end of the record."""
-        settings, kept = self.plan.evaluation, self.folder.parents[1] / "references"
-        path, columns = self.folder / "evaluations.csv", EVALUATION_COLUMNS
-        drives, rows = (settings.starts, settings.actions), []
-        for world in sorted({row["world"] for row in read_csv(path, columns)}):
-            for driver in DRIVERS:
-                figures = self._observer.reference(world, driver, *drives, kept)
-                rows.append(self._evaluation_row("reference", driver, world, figures))
-        append_csv(path, columns, rows)
-
-    def _evaluation_row(self, label: str, driver: str, world: str, figures: Figures) -> Row:
-        counters = self._loop.counters
-        return {
-            "label": label,
-            "driver": driver,
-            "stage": self._stage_name,
-            "episode": counters.episode,
-            "total_actions": counters.actions,
-            "train_steps": self._loop.trainer.train_steps,
-            "world": world,
-            **{key: _short(value) for key, value in figures.items()},
-            "seconds": round(self._totals.seconds, 1),
-        }
+        snapshot.replace(self.folder, snapshot.END, self._loop, self._extra())
 
     def _check_lap(self) -> None:
         """Whether the frozen policy drives a lap already, looked at every so many actions."""
@@ -341,13 +212,22 @@ class Run:
             return
         self._totals.lap_checked_at = actions // every
         self._show()
-        if self._observer.drives_lap(world.name):
-            self._totals.first_lap = {
-                "seconds": round(self._totals.seconds, 1),
-                "actions": actions,
-                "episode": self._loop.counters.episode,
-                "train_steps": self._loop.trainer.train_steps,
-            }
+        if self._evaluations.drives_lap(world.name):
+            self._totals.note_lap(self._loop)
+
+    @property
+    def _world(self) -> str:
+        return self._loop.config.robot.world
+
+    def _now(self) -> Row:
+        """How far the run is, as the columns of `evaluations.csv` say it."""
+        return {
+            "stage": self._stage_name,
+            "episode": self._loop.counters.episode,
+            "total_actions": self._loop.counters.actions,
+            "train_steps": self._loop.trainer.train_steps,
+            "seconds": round(self._totals.seconds, 1),
+        }
 
     @property
     def _all_actions(self) -> int:
@@ -355,26 +235,20 @@ class Run:
         return self._loop.actor.actions
 
     def _show(self) -> None:
-        """Let the observer look at the target network as it is now."""
-        self._observer.show(to_bytes(self._loop.trainer.target_network))
-
-    def _robot(self, world: str) -> SimRobot:
-        return SimRobot(self._config(0).robot, load_world(world), self.seed)
+        """Let the target network, as it is now, be looked at."""
+        self._evaluations.show(to_bytes(self._loop.trainer.target_network))
 
     # ------------------------------------------------------------ records
 
     def _record(self, done: TurnDone) -> None:
-        episode, totals = done.submitted, self._totals
-        totals.run_actions, length = bump_free(totals.run_actions, episode)
+        if self._totals.count(done):
+            self._best = self._driving
         if not done.commit.episode:
             return
-        totals.one_action_episodes += episode.actions == 1
-        self._fitness = [*self._fitness[-99:], episode.fitness]
-        if length > totals.longest_run:
-            totals.longest_run, self._best = length, self._driving
+        self._fitness = [*self._fitness[-99:], done.submitted.fitness]
         if done.target_changed:
             self._driving = to_bytes(self._loop.trainer.target_network)
-        row = episode_row(self._loop, done, self._stage_name, totals.seconds)
+        row = episode_row(self._loop, done, self._stage_name, self._totals.seconds)
         append_csv(self.folder / EPISODES, EPISODE_COLUMNS, [row])
 
     def _write_run(self, *, complete: bool) -> None:
@@ -398,7 +272,7 @@ class Run:
             complete=complete,
             seconds=round(totals.seconds, 1),
             episodes=episodes,
-            one_action_share=_short(totals.one_action_episodes / max(episodes, 1)),
+            one_action_share=round(totals.one_action_episodes / max(episodes, 1), 5),
             actions=counters.actions,
             fill_actions=self._all_actions - counters.actions,
             train_steps=self._loop.trainer.train_steps,
@@ -424,28 +298,23 @@ class Run:
         }
 
     def _save(self) -> None:
-        number = self._loop.counters.commit
-        snapshot.save(self.folder / f"state-{number}", self._loop, self._extra())
-        for old in self.folder.glob("state-[0-9]*"):
-            if old.name != f"state-{number}":
-                shutil.rmtree(old)
+        name = f"state-{self._loop.counters.commit}"
+        snapshot.replace(self.folder, name, self._loop, self._extra())
         self._write_run(complete=False)
 
     def _restore(self, predecessor: Path | None) -> None:
         """Go on from the newest snapshot, from the predecessor's end, or begin."""
-        own = [path for path in self.folder.glob("state-[0-9]*") if snapshot.exists(path)]
-        if self.complete:
-            self._take_up(snapshot.restore(self.folder / END, self._loop))
-        elif own:
-            newest = max(own, key=lambda path: int(path.name.removeprefix("state-")))
-            self._take_up(snapshot.restore(newest, self._loop))
+        own = snapshot.newest(self.folder)
+        if own is not None:
+            self._take_up(snapshot.restore(own, self._loop))
         elif predecessor is not None:
-            if not snapshot.exists(predecessor / END):
+            end = predecessor / snapshot.END
+            if not snapshot.exists(end):
                 raise StateError(
                     f"{predecessor}: {self.plan.name} goes on from {self.plan.after}, which has "
                     f"not been run to its end there: run it first"
                 )
-            snapshot.restore(predecessor / END, self._loop)
+            snapshot.restore(end, self._loop)
             self._offset = self._loop.counters.episode
         self._driving = to_bytes(self._loop.trainer.target_network)
         self._best = self._best or self._driving  # until an episode of this run was driven
@@ -464,10 +333,7 @@ class Run:
     def _drop_unsaved(self) -> None:
         """Rows written after the snapshot come again."""
         newest = self._loop.counters.episode if self._totals.stages else 0
-        for name, columns in (
-            (EPISODES, EPISODE_COLUMNS),
-            ("evaluations.csv", EVALUATION_COLUMNS),
-        ):
+        for name, columns in ((EPISODES, EPISODE_COLUMNS), (EVALUATIONS, EVALUATION_COLUMNS)):
             path = self.folder / name
             rows = [r for r in read_csv(path, columns) if int(r["episode"]) <= newest]
             write_csv(path, columns, rows)
@@ -481,7 +347,3 @@ class Run:
             actions=self._all_actions,
             fitness=float(np.mean(self._fitness)) if self._fitness else 0.0,
         )
-
-
-def _short(value: float) -> float:
-    return round(float(value), 5)

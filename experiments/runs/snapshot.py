@@ -19,6 +19,8 @@ from shared.statefile import write_atomically
 
 CHECKPOINT, MEMORY, STATE = "checkpoint.safetensors", "memory.npz", "state.msgpack"
 SCHEMA = 2
+END = "state-end"
+"""Name of the last snapshot of a run. Those on the way are `state-<turn>`."""
 
 
 def save(folder: Path, loop: SingleProcess, extra: dict[str, Any]) -> None:
@@ -47,6 +49,22 @@ def save(folder: Path, loop: SingleProcess, extra: dict[str, Any]) -> None:
         "extra": extra,
     }
     write_atomically(folder / STATE, msgpack.packb(state))
+
+
+def replace(run: Path, name: str, loop: SingleProcess, extra: dict[str, Any]) -> None:
+    """Save the state into the folder of a run, and delete its older snapshots."""
+    save(run / name, loop, extra)
+    for old in run.glob("state-[0-9]*"):
+        if old.name != name:
+            shutil.rmtree(old)
+
+
+def newest(run: Path) -> Path | None:
+    """The last snapshot in the folder of a run, if there is one."""
+    if exists(run / END):
+        return run / END
+    own = [path for path in run.glob("state-[0-9]*") if exists(path)]
+    return max(own, key=lambda path: int(path.name.removeprefix("state-")), default=None)
 
 
 def exists(folder: Path) -> bool:

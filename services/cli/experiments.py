@@ -84,7 +84,7 @@ def evaluate(
     The run's own config.toml tells robot and network; --config and --set stand in for a missing one
     or change it.
     """
-    command = import_installed("experiments.drives.evaluate", "experiments")
+    command = import_installed("experiments.drives.evaluate_command", "experiments")
     file = config or import_installed("services.commander.frozen", "actor").configuration_of(run)
     loaded = load(None, file, set_, others={"robot.world": world})
     folder = out or Path(f"evaluation-{loaded.robot.world}")

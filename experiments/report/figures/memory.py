@@ -17,7 +17,7 @@ from experiments.report.figures.style import (
     sheet,
     styled,
 )
-from experiments.report.run_folder import Experiment, Floats, Run
+from experiments.report.run_folder import Experiment, Floats, RunFolder
 from experiments.report.statistics import Curve, band_of_blocks
 from shared.facts import ACTION_COUNT, SHORT_NAMES
 
@@ -49,7 +49,7 @@ def by_world(experiment: Experiment) -> Figure:
     return _drawn(experiment, parts, colours(names), None)
 
 
-def _thinned(run: Run, values: Floats) -> Curve:
+def _thinned(run: RunFolder, values: Floats) -> Curve:
     """The state after every tenth part of a window: as much as can be seen."""
     episodes = run.episodes.numbers("episode")
     step = max(1, run.window // 10)

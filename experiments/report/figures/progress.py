@@ -18,7 +18,7 @@ from experiments.report.figures.style import (
     sheet,
     styled,
 )
-from experiments.report.run_folder import Experiment, Run
+from experiments.report.run_folder import Experiment, RunFolder
 from experiments.report.statistics import (
     Band,
     Curve,
@@ -36,7 +36,7 @@ ZOOM = 0.06
 """Part of all episodes on each side of the best point that the lower plot shows."""
 
 
-def curve_of(run: Run, column: str) -> Curve:
+def curve_of(run: RunFolder, column: str) -> Curve:
     """Means of a column over the run's window of episodes."""
     return block_means(run.episodes.numbers("episode"), run.episodes.numbers(column), run.window)
 
@@ -63,7 +63,7 @@ def fitness(experiment: Experiment) -> Figure:
     return figure
 
 
-def _full_episodes(axes: Axes, run: Run) -> None:
+def _full_episodes(axes: Axes, run: RunFolder) -> None:
     episodes = run.episodes.numbers("episode")
     full = episodes[run.episodes.numbers("fitness") >= FULL]
     label = "" if GREEN in [line.get_color() for line in axes.lines[1:]] else f"{FULL} reached"

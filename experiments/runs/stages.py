@@ -1,0 +1,57 @@
+"""Puts a stage of a plan into effect: configuration, world, retention and capacity of the loop."""
+
+from __future__ import annotations
+
+from experiments.plans.plan import Plan, Stage, merged
+from experiments.single_process import SingleProcess
+from shared.config import Config
+from shared.errors import ConfigError
+from shared.messages import WorldChange
+from shared.rl.retention.rmm import force_candidates
+from shared.rl.retention.strategy import begin
+
+
+def enter(
+    loop: SingleProcess, plan: Plan, stage: Stage, config: Config, offset: int, *, first: bool
+) -> None:
+    """Let the loop go on in a stage.
+
+    Args:
+        loop: Between two turns.
+        plan: Of the run.
+        stage: The stage.
+        config: Of the stage.
+        offset: Episodes before this run.
+        first: Whether the run begins with this stage.
+
+    Raises:
+        ConfigError: The driver refuses a change of the world.
+    """
+    before = loop.config
+    loop.reconfigure(config)
+    if config.robot.world != loop.env.robot.world.name:
+        episode = loop.counters.episode
+        switch = WorldChange(kind="switch", world=config.robot.world, at_episode=episode)
+        _change(loop, plan, switch)
+    for change in stage.changes:
+        at = offset + int(change["at_episode"])
+        _change(loop, plan, WorldChange.model_validate({**change, "at_episode": at}))
+    if stage.force_candidates:
+        force_candidates(loop.memory, loop.memory.ids)
+    # Both change on the way: a stage sets them where it says something new.
+    named = merged(plan.config, stage.config).get("memory", {})
+    known, wanted = begin(before.memory), begin(config.memory)
+    loop.memory.kept |= {  # a first stage that names none keeps it (E45)
+        key: value
+        for key, value in wanted.items()
+        if (key in named if first else known[key] != value)
+    }
+    if first or before.memory.capacity != config.memory.capacity:
+        loop.memory.set_capacity(config.memory.capacity)
+
+
+def _change(loop: SingleProcess, plan: Plan, wish: WorldChange) -> None:
+    """Raises ConfigError when the driver refuses."""
+    answer = loop.env.driver.change(wish)
+    if not answer.accepted:
+        raise ConfigError(f"plan {plan.name}: {wish.kind}: {answer.reason}")

@@ -1,0 +1,70 @@
+"""What a run counts beside its loop: time, stages, laps, and actions without a bump."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from experiments.single_process import SingleProcess, TurnDone
+from services.replay.numbering import bump_free
+
+
+@dataclass
+class Totals:
+    """Saved with each snapshot."""
+
+    seconds: float = 0.0
+    """Wall time of driving and learning, evaluations not counted."""
+    evaluated_at: int = -1
+    """Actions at the last evaluation on the way."""
+    lap_checked_at: int = -1
+    first_lap: dict[str, float] = field(default_factory=dict)
+    run_actions: int = 0
+    """Actions since the newest bump or interruption, in this run."""
+    longest_run: int = 0
+    """Most actions without a bump, in this run (E10, E43)."""
+    prefill: str = ""
+    """Hash of the memory as the first episode began: equal for all that shared it."""
+    one_action_episodes: int = 0
+    """Counted episodes of this run that lasted a single action (E11)."""
+    stages: list[dict[str, Any]] = field(default_factory=list)
+
+    def count(self, done: TurnDone) -> bool:
+        """Count a turn; whether a counted episode made the longest run without a bump longer."""
+        self.run_actions, length = bump_free(self.run_actions, done.submitted)
+        if not done.commit.episode:
+            return False
+        self.one_action_episodes += done.submitted.actions == 1
+        longer = length > self.longest_run
+        self.longest_run = max(length, self.longest_run)
+        return longer
+
+    def begin_stage(self, name: str, world: str, loop: SingleProcess) -> None:
+        """Note where a stage begins."""
+        self.stages.append(
+            {
+                "name": name,
+                "world": world,
+                "first_episode": loop.counters.episode + 1,
+                "first_action": loop.counters.actions,
+                "first_train_step": loop.trainer.train_steps,
+                "first_second": self.seconds,
+            }
+        )
+
+    def end_stage(self, loop: SingleProcess) -> None:
+        """Say how much the newest stage was."""
+        entry = self.stages[-1]
+        entry["last_episode"] = loop.counters.episode
+        entry["actions"] = loop.counters.actions - entry.pop("first_action")
+        entry["train_steps"] = loop.trainer.train_steps - entry.pop("first_train_step")
+        entry["seconds"] = round(self.seconds - entry.pop("first_second"), 1)
+
+    def note_lap(self, loop: SingleProcess) -> None:
+        """Note when the network first drove a lap."""
+        self.first_lap = {
+            "seconds": round(self.seconds, 1),
+            "actions": loop.actor.actions,
+            "episode": loop.counters.episode,
+            "train_steps": loop.trainer.train_steps,
+        }
