@@ -26,6 +26,8 @@ from services.robot_driver.robot import (
     Sensed,
     Velocity,
 )
+from services.robot_driver.simulated.kinematics import advance, wrap
+from services.robot_driver.simulated.lap_counter import LapCounter
 from services.robot_driver.simulated.scene import Scene
 from services.robot_driver.simulated.world import (
     MAX_OBSTACLES,
@@ -50,25 +52,6 @@ _HALVINGS = 6
 """Of a substep that would touch: what is left of 1 cm is well inside the skin."""
 
 
-def wrap(angle_rad: float) -> float:
-    """The same direction in -pi..pi."""
-    return math.remainder(angle_rad, 2.0 * math.pi)
-
-
-def advance(pose: Pose, velocity: Velocity, duration_s: float) -> Pose:
-    """Where constant body velocity leads without walls: exact, an arc when turning."""
-    turn = velocity.turn_rad_s * duration_s
-    forward, left = velocity.forward_m_s * duration_s, velocity.left_m_s * duration_s
-    half = turn / 2.0
-    chord = math.sin(half) / half if abs(half) > 1e-9 else 1.0
-    c, s = math.cos(pose.heading_rad + half), math.sin(pose.heading_rad + half)
-    return Pose(
-        pose.x_m + chord * (forward * c - left * s),
-        pose.y_m + chord * (forward * s + left * c),
-        wrap(pose.heading_rad + turn),
-    )
-
-
 class SimRobot(Robot):
     """A Robotino in a world, as `robot.Robot`; deterministic and without noise.
 
@@ -90,9 +73,7 @@ class SimRobot(Robot):
         self._pose = _pose_of(world.starts[0])
         self._velocity = STANDSTILL
         self._time_s = 0.0
-        self._winding_rad = 0.0
-        self._lap_start_rad = 0.0
-        self._left = self._right = 0
+        self._laps = LapCounter()
         self._scene = self._at_start(world, 0)
 
     @property
@@ -107,8 +88,8 @@ class SimRobot(Robot):
 
     @property
     def laps(self) -> Laps:
-        """Laps so far; one counts when 2 pi of new net angle round the lap centre is reached."""
-        return Laps(self._left - self._right, self._left, self._right)
+        """Laps so far."""
+        return self._laps.laps
 
     @property
     def changeable(self) -> ChangeableWorld:
@@ -200,7 +181,7 @@ class SimRobot(Robot):
         self._show(self._at_start(world, start))
         self.world, self.obstacles = world, world.obstacles
         self._pose, self._velocity = _pose_of(world.starts[start]), STANDSTILL
-        self._winding_rad = self._lap_start_rad = 0.0
+        self._laps = LapCounter(left=self._laps.left, right=self._laps.right)
 
     def state(self) -> dict[str, float | int | str]:
         """Everything that decides what happens next."""
@@ -215,10 +196,10 @@ class SimRobot(Robot):
             "left_m_s": self._velocity.left_m_s,
             "turn_rad_s": self._velocity.turn_rad_s,
             "time_s": self._time_s,
-            "winding_rad": self._winding_rad,
-            "lap_start_rad": self._lap_start_rad,
-            "laps_left": self._left,
-            "laps_right": self._right,
+            "winding_rad": self._laps.winding_rad,
+            "lap_start_rad": self._laps.lap_start_rad,
+            "laps_left": self._laps.left,
+            "laps_right": self._laps.right,
         }
 
     def restore(self, state: dict[str, float | int | str]) -> None:
@@ -235,12 +216,13 @@ class SimRobot(Robot):
         pose = Pose(*(_number(state, key) for key in ("x_m", "y_m", "heading_rad")))
         speeds = ("forward_m_s", "left_m_s", "turn_rad_s")
         velocity = Velocity(*(_number(state, key) for key in speeds))
-        times = [_number(state, key) for key in ("time_s", "winding_rad", "lap_start_rad")]
-        laps = [int(_number(state, key)) for key in ("laps_left", "laps_right")]
+        time_s = _number(state, "time_s")
+        winding_rad, lap_start_rad = _number(state, "winding_rad"), _number(state, "lap_start_rad")
+        left, right = int(_number(state, "laps_left")), int(_number(state, "laps_right"))
         self._put(world, obstacles, pose)
         self._pose, self._velocity = pose, velocity
-        self._time_s, self._winding_rad, self._lap_start_rad = times
-        self._left, self._right = laps
+        self._time_s = time_s
+        self._laps = LapCounter(winding_rad, lap_start_rad, left, right)
 
     def close(self) -> None:
         """Free the simulation. May be called twice."""
@@ -264,7 +246,8 @@ class SimRobot(Robot):
         if free < GAP_M and way > 0.0:
             after, free = self._blocked(before, after)
         self._pose = after
-        self._count_laps(before, after)
+        if self.world.lap is not None:
+            self._laps.add(self.world.lap.centre, before, after)
         return free
 
     def _blocked(self, before: Pose, after: Pose) -> tuple[Pose, float]:
@@ -282,20 +265,6 @@ class SimRobot(Robot):
                 x, y = nearer.x_m, nearer.y_m
         pose = Pose(x, y, after.heading_rad)
         return pose, min(self._clearance(pose), SKIN_M)
-
-    def _count_laps(self, before: Pose, after: Pose) -> None:
-        if self.world.lap is None:
-            return
-        cx, cy = self.world.lap.centre
-        now = math.atan2(after.y_m - cy, after.x_m - cx)
-        self._winding_rad += wrap(now - math.atan2(before.y_m - cy, before.x_m - cx))
-        progress = self._winding_rad - self._lap_start_rad
-        if abs(progress) >= 2.0 * math.pi:
-            self._lap_start_rad += math.copysign(2.0 * math.pi, progress)
-            if progress > 0.0:
-                self._left += 1
-            else:
-                self._right += 1
 
     def _clearance(self, pose: Pose) -> float:
         return self._scene.clearance(pose.x_m, pose.y_m)

@@ -9,7 +9,8 @@ import pytest
 from services.robot_driver.atlas.planner import CONTACT_M, Motion, Planner
 from services.robot_driver.atlas.survey import corridor_width, drive_randomly
 from services.robot_driver.robot import Pose, Velocity
-from services.robot_driver.simulated.sim import SimRobot, advance
+from services.robot_driver.simulated.kinematics import advance
+from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import World, load_world
 from shared.config import RobotConfig
 

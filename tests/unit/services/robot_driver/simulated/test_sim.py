@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from services.robot_driver.recovery import back_off
 from services.robot_driver.robot import Pose, Robot, Velocity
-from services.robot_driver.simulated.sim import GAP_M, SKIN_M, SimRobot, advance, wrap
+from services.robot_driver.simulated.kinematics import advance, wrap
+from services.robot_driver.simulated.sim import GAP_M, SKIN_M, SimRobot
 from services.robot_driver.simulated.world import World, load_world
 from shared.config import RobotConfig
 
