@@ -50,7 +50,7 @@ def test_zenoh_is_imported_by_our_bus_and_by_that_to_foreign_networks() -> None:
 
 
 def test_one_file_imports_rosbags() -> None:
-    assert users("rosbags") == {"services/robot_driver/real/cdr.py"}
+    assert users("rosbags") == {"services/robot_driver/real/ros2_types.py"}
 
 
 def test_one_file_imports_pybullet() -> None:

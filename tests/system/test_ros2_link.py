@@ -14,7 +14,7 @@ from robots import BRIDGE, RMW_ZENOH, real_time, ros2_emulator
 
 from benchmarks.waiting import wait_until
 from services.robot_driver.emulation.ros2_faults import Ros2Faults
-from services.robot_driver.real import cdr, ros2_names
+from services.robot_driver.real import cdr, ros2_names, ros2_types
 from services.robot_driver.real.ros2 import Ros2Link
 from services.robot_driver.real.ros2_names import Attachment, Endpoint
 from services.robot_driver.robot import STANDSTILL, Pose, RobotFault, Velocity
@@ -50,7 +50,7 @@ class Hand:
 
     def publishes(self, topic: str, kind: str) -> Callable[[], None]:
         """Tell that somebody publishes a topic; returns what ends that."""
-        endpoint = Endpoint("publishes", topic, cdr.FULL_NAMES[kind])
+        endpoint = Endpoint("publishes", topic, ros2_types.FULL_NAMES[kind])
         return self.bus.token(ros2_names.bridge_token(self.bus.zid, endpoint))
 
     def say(self, topic: str, raw: bytes, attachment: bytes = b"") -> None:
@@ -156,7 +156,9 @@ def test_stamps_are_of_the_robots_clock_and_grow(hand: Hand) -> None:
 
 
 def test_rmw_zenoh_gets_the_exact_key_and_an_attachment_that_counts(hand: Hand) -> None:
-    key = ros2_names.rmw_key(3, "bot1/cmd_vel", cdr.FULL_NAMES["Twist"], cdr.type_hash("Twist"))
+    key = ros2_names.rmw_key(
+        3, "bot1/cmd_vel", ros2_types.FULL_NAMES["Twist"], ros2_types.type_hash("Twist")
+    )
     hand.bus.subscribe(hand.inbox, "velocity", key, max_bytes=4096, keep=16)
     settings = {"transport": "rmw-zenoh", "domain": 3, "namespace": "bot1"}
     with linked(hand, **settings) as link:
@@ -172,7 +174,7 @@ def test_rmw_zenoh_gets_the_exact_key_and_an_attachment_that_counts(hand: Hand) 
 
 
 def test_humble_has_no_hashes(hand: Hand) -> None:
-    key = ros2_names.rmw_key(0, "cmd_vel", cdr.FULL_NAMES["Twist"], "TypeHashNotSupported")
+    key = ros2_names.rmw_key(0, "cmd_vel", ros2_types.FULL_NAMES["Twist"], "TypeHashNotSupported")
     hand.bus.subscribe(hand.inbox, "velocity", key, max_bytes=4096, keep=16)
     settings = {"transport": "rmw-zenoh", "velocity_type": "Twist"}
     with linked(hand, **settings, distribution="humble") as link:
@@ -256,7 +258,9 @@ def test_the_shortest_touch_is_seen(hand: Hand) -> None:
 
 def test_rmw_zenoh_samples_count_once_and_only_with_their_attachment(hand: Hand) -> None:
     with linked(hand, transport="rmw-zenoh") as link:
-        key = ros2_names.rmw_key(0, "bumper", cdr.FULL_NAMES["Bool"], cdr.type_hash("Bool"))
+        key = ros2_names.rmw_key(
+            0, "bumper", ros2_types.FULL_NAMES["Bool"], ros2_types.type_hash("Bool")
+        )
         released, pressed = (cdr.encode_bumper(value, "Bool") for value in (False, True))
         gid = bytes(16)
         hand.say(key, pressed)

@@ -27,9 +27,9 @@ from services.robot_driver.emulation.ros2_faults import TRUTH_KEY, Ros2Faults
 from services.robot_driver.emulation.ros2_network import Network
 from services.robot_driver.emulation.world import EmulatedRobot
 from services.robot_driver.real import cdr, ros2_names
-from services.robot_driver.real.cdr import VelocityType
 from services.robot_driver.real.link import Battery
 from services.robot_driver.real.picture import RgbImage
+from services.robot_driver.real.ros2_types import VelocityType
 from shared.config import RobotConfig
 from shared.errors import BadMessage, ConfigError, RouterMissing
 from shared.facts import IMAGE_HEIGHT, IMAGE_WIDTH

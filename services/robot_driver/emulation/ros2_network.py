@@ -7,9 +7,9 @@ import time
 from typing import Literal
 
 from services.robot_driver.emulation.ros2_faults import FAULTS_KEY, TRUTH_KEY
-from services.robot_driver.real import cdr, ros2_names
-from services.robot_driver.real.cdr import VelocityType
+from services.robot_driver.real import ros2_names, ros2_types
 from services.robot_driver.real.ros2_names import Attachment, Endpoint
+from services.robot_driver.real.ros2_types import VelocityType
 from shared.config import Ros2Config
 from shared.foreign_bus import ForeignBus, RawInbox, RawPublisher, Undeclare
 
@@ -85,17 +85,19 @@ class Network:
         full = ros2_names.full_topic(self._ros.namespace, topic)
         if self._ros.transport == "bridge":
             return full
-        return ros2_names.rmw_key(self._ros.domain, full, cdr.FULL_NAMES[kind], self._hash(kind))
+        return ros2_names.rmw_key(
+            self._ros.domain, full, ros2_types.FULL_NAMES[kind], self._hash(kind)
+        )
 
     def _hash(self, kind: str) -> str:
         humble = self._ros.distribution == "humble"
-        return ros2_names.NO_HASH if humble else cdr.type_hash(kind)
+        return ros2_names.NO_HASH if humble else ros2_types.type_hash(kind)
 
     def _announce(
         self, direction: Literal["publishes", "listens"], topic: str, kind: str
     ) -> Undeclare:
         full = ros2_names.full_topic(self._ros.namespace, topic)
-        endpoint = Endpoint(direction, full, cdr.FULL_NAMES[kind])
+        endpoint = Endpoint(direction, full, ros2_types.FULL_NAMES[kind])
         if self._ros.transport == "bridge":
             return self._bus.token(ros2_names.bridge_token(self._bus.zid, endpoint))
         self._entities += 1

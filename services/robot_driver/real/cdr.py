@@ -1,4 +1,4 @@
-"""ROS 2 messages to and from CDR, without a ROS installation; the only file that imports rosbags.
+"""Turns what a robot tells and is told into ROS 2 messages (`ros2_types.py`) and back.
 
 Everything that comes from the network is checked before it means anything: sizes, encapsulation,
 length, finite numbers. Units and axes are those of ROS, which are ours: SI, x forward, y left,
@@ -9,65 +9,31 @@ The reason of a BadMessage comes first and is of a small vocabulary, details fol
 
 from __future__ import annotations
 
-import functools
 import math
 from dataclasses import dataclass
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Generic, TypeVar
 
 import cv2
 import numpy as np
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from services.robot_driver.real.link import Battery
 from services.robot_driver.real.picture import MAX_SIDE_PX, RgbImage, decoded
+from services.robot_driver.real.ros2_types import (
+    FULL_NAMES,
+    BatteryType,
+    BumperType,
+    CameraType,
+    VelocityType,
+    decode,
+    encode,
+    header,
+    new,
+    stamp_ns_of,
+)
 from services.robot_driver.robot import Pose, Velocity
 from shared.errors import BadMessage
 
 T = TypeVar("T")
-VelocityType = Literal["Twist", "TwistStamped"]
-CameraType = Literal["Image", "CompressedImage"]
-BumperType = Literal["Bool", "HazardDetectionVector"]
-BatteryType = Literal["BatteryState", "PowerReadings"]
-
-FULL_NAMES = {
-    "Twist": "geometry_msgs/msg/Twist",
-    "TwistStamped": "geometry_msgs/msg/TwistStamped",
-    "Odometry": "nav_msgs/msg/Odometry",
-    "Image": "sensor_msgs/msg/Image",
-    "CompressedImage": "sensor_msgs/msg/CompressedImage",
-    "Bool": "std_msgs/msg/Bool",
-    "HazardDetectionVector": "irobot_create_msgs/msg/HazardDetectionVector",
-    "BatteryState": "sensor_msgs/msg/BatteryState",
-    "PowerReadings": "rto_msgs/msg/PowerReadings",
-}
-"""By short name, the types a robot is driven with."""
-
-KIB = 1024
-MAX_BYTES = {
-    "Twist": 4 * KIB,
-    "TwistStamped": 4 * KIB,
-    "Odometry": 16 * KIB,
-    "Image": 3 * 2048 * 2048 + 4 * KIB,
-    "CompressedImage": 4 * KIB * KIB,
-    "Bool": 64,
-    "HazardDetectionVector": 64 * KIB,
-    "BatteryState": 16 * KIB,
-    "PowerReadings": 4 * KIB,
-}
-"""Longest payload of each type; longer ones are refused unread."""
-
-# Fields of the types that do not come with ROS itself.
-_CUSTOM = {
-    "irobot_create_msgs/msg/HazardDetection": "std_msgs/Header header\nuint8 type\n",
-    "irobot_create_msgs/msg/HazardDetectionVector": (
-        "std_msgs/Header header\nirobot_create_msgs/HazardDetection[] detections\n"
-    ),
-    "rto_msgs/msg/PowerReadings": (
-        "std_msgs/Header header\nfloat32 current\nfloat32 voltage\nbool battery_low\n"
-    ),
-}
-
 BUMP, CLIFF, STALL = 1, 2, 3
 """Kinds of hazards of a Create 3 that end an action: it touches something, stands before a step,
 or pushes against what its bumper does not feel."""
@@ -89,9 +55,6 @@ _FROM_RGB = {
     "rgba8": cv2.COLOR_RGB2RGBA,
     "bgra8": cv2.COLOR_RGB2BGRA,
 }
-_ENCAPSULATIONS = (b"\x00\x00", b"\x00\x01")
-"""CDR, big and little endian; what follows are options that mean nothing."""
-_S_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -107,7 +70,7 @@ class Stamped(Generic[T]):
 
 def decode_odometry(raw: bytes) -> Stamped[Pose]:
     """Pose of a nav_msgs/Odometry; heading from its quaternion. Raises BadMessage."""
-    message = _decode(raw, "Odometry")
+    message = decode(raw, "Odometry")
     position, q = message.pose.pose.position, message.pose.pose.orientation
     numbers = (position.x, position.y, q.x, q.y, q.z, q.w)
     if not all(math.isfinite(number) for number in numbers):
@@ -119,7 +82,7 @@ def decode_odometry(raw: bytes) -> Stamped[Pose]:
     heading = math.atan2(
         2.0 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z
     )
-    return Stamped(Pose(position.x, position.y, heading), _stamp_ns(message))
+    return Stamped(Pose(position.x, position.y, heading), stamp_ns_of(message))
 
 
 def decode_camera(raw: bytes, kind: CameraType) -> Stamped[RgbImage]:
@@ -129,11 +92,11 @@ def decode_camera(raw: bytes, kind: CameraType) -> Stamped[RgbImage]:
         BadMessage: Also for an encoding that is not 8 bits grey or colour, rows whose length does
             not fit, depth images, and pictures that break off.
     """
-    message = _decode(raw, kind)
+    message = decode(raw, kind)
     if kind == "CompressedImage":
         if "compressedDepth" in message.format:
             raise BadMessage("a depth image")
-        return Stamped(decoded(message.data.tobytes()), _stamp_ns(message))
+        return Stamped(decoded(message.data.tobytes()), stamp_ns_of(message))
     channels = _CHANNELS.get(message.encoding)
     if channels is None:
         raise BadMessage(f"unknown encoding: {message.encoding!r:.40}, known: {list(_CHANNELS)}")
@@ -149,16 +112,16 @@ def decode_camera(raw: bytes, kind: CameraType) -> Stamped[RgbImage]:
     pixels = np.ascontiguousarray(rows).reshape(height, width, channels)
     code = _TO_RGB.get(message.encoding)
     rgb = pixels if code is None else cv2.cvtColor(pixels, code)
-    return Stamped(np.asarray(rgb, np.uint8), _stamp_ns(message))
+    return Stamped(np.asarray(rgb, np.uint8), stamp_ns_of(message))
 
 
 def decode_bumper(raw: bytes, kind: BumperType) -> Stamped[bool]:
     """Whether there is contact, of a std_msgs/Bool or a Create 3's hazards. Raises BadMessage."""
-    message = _decode(raw, kind)
+    message = decode(raw, kind)
     if kind == "Bool":
         return Stamped(bool(message.data), 0)
     pressed = any(detection.type in CONTACTS for detection in message.detections)
-    return Stamped(pressed, _stamp_ns(message))
+    return Stamped(pressed, stamp_ns_of(message))
 
 
 def decode_battery(raw: bytes, kind: BatteryType) -> Stamped[Battery]:
@@ -166,24 +129,24 @@ def decode_battery(raw: bytes, kind: BatteryType) -> Stamped[Battery]:
 
     Raises BadMessage. A BatteryState tells what it does not know as not-a-number.
     """
-    message = _decode(raw, kind)
+    message = decode(raw, kind)
     if kind == "PowerReadings":
         low = bool(message.battery_low)
     else:
         low = 0.0 <= message.percentage < LOW_CHARGE
     voltage = float(message.voltage)
     sane = math.isfinite(voltage) and 0.0 < voltage < 100.0
-    return Stamped(Battery(low, voltage if sane else None), _stamp_ns(message))
+    return Stamped(Battery(low, voltage if sane else None), stamp_ns_of(message))
 
 
 def decode_velocity(raw: bytes, kind: VelocityType) -> Stamped[Velocity]:
     """A velocity command. Raises BadMessage, also unless it is finite."""
-    message = _decode(raw, kind)
+    message = decode(raw, kind)
     twist = message.twist if kind == "TwistStamped" else message
     velocity = Velocity(twist.linear.x, twist.linear.y, twist.angular.z)
     if not all(math.isfinite(n) for n in (*_xyz(twist.linear), *_xyz(twist.angular))):
         raise BadMessage("not finite")
-    return Stamped(velocity, _stamp_ns(message) if kind == "TwistStamped" else 0)
+    return Stamped(velocity, stamp_ns_of(message) if kind == "TwistStamped" else 0)
 
 
 # ---------------------------------------------------------------- to the robot, and as one
@@ -198,8 +161,8 @@ def encode_velocity(
         raise ValueError(f"velocity {parts}: expected three finite numbers")
     message = _twist(velocity)
     if kind == "TwistStamped":
-        message = _new(FULL_NAMES[kind], header=_header(stamp_ns, "base_link"), twist=message)
-    return _encode(message, kind, little_endian)
+        message = new(FULL_NAMES[kind], header=header(stamp_ns, "base_link"), twist=message)
+    return encode(message, kind, little_endian)
 
 
 def encode_odometry(
@@ -208,24 +171,24 @@ def encode_odometry(
     """Odometry of a base, covariances zero."""
     half = pose.heading_rad / 2.0
     turn = {"x": 0.0, "y": 0.0, "z": math.sin(half), "w": math.cos(half)}
-    place = _new(
+    place = new(
         "geometry_msgs/msg/Pose",
-        position=_new("geometry_msgs/msg/Point", x=pose.x_m, y=pose.y_m, z=0.0),
-        orientation=_new("geometry_msgs/msg/Quaternion", **turn),
+        position=new("geometry_msgs/msg/Point", x=pose.x_m, y=pose.y_m, z=0.0),
+        orientation=new("geometry_msgs/msg/Quaternion", **turn),
     )
     covariance = np.zeros(36, np.float64)
-    message = _new(
+    message = new(
         FULL_NAMES["Odometry"],
-        header=_header(stamp_ns, "odom"),
+        header=header(stamp_ns, "odom"),
         child_frame_id="base_link",
-        pose=_new("geometry_msgs/msg/PoseWithCovariance", pose=place, covariance=covariance),
-        twist=_new(
+        pose=new("geometry_msgs/msg/PoseWithCovariance", pose=place, covariance=covariance),
+        twist=new(
             "geometry_msgs/msg/TwistWithCovariance",
             twist=_twist(velocity),
             covariance=covariance,
         ),
     )
-    return _encode(message, "Odometry", little_endian)
+    return encode(message, "Odometry", little_endian)
 
 
 def encode_image(
@@ -243,9 +206,9 @@ def encode_image(
     rows = pixels.reshape(height, width * _CHANNELS[encoding])
     if padding:
         rows = np.pad(rows, ((0, 0), (0, padding)))
-    message = _new(
+    message = new(
         FULL_NAMES["Image"],
-        header=_header(stamp_ns, "camera"),
+        header=header(stamp_ns, "camera"),
         height=height,
         width=width,
         encoding=encoding,
@@ -253,7 +216,7 @@ def encode_image(
         step=rows.shape[1],
         data=np.ascontiguousarray(rows).reshape(-1),
     )
-    return _encode(message, "Image", little_endian)
+    return encode(message, "Image", little_endian)
 
 
 def encode_compressed_image(
@@ -265,13 +228,13 @@ def encode_compressed_image(
     little_endian: bool = True,
 ) -> bytes:
     """A picture that is compressed already; `form` is the message's `format`."""
-    message = _new(
+    message = new(
         FULL_NAMES["CompressedImage"],
-        header=_header(stamp_ns, frame_id),
+        header=header(stamp_ns, frame_id),
         format=form,
         data=np.frombuffer(data, np.uint8),
     )
-    return _encode(message, "CompressedImage", little_endian)
+    return encode(message, "CompressedImage", little_endian)
 
 
 def encode_bumper(
@@ -279,18 +242,18 @@ def encode_bumper(
 ) -> bytes:
     """Contact as std_msgs/Bool, or as a Create 3 tells it: hazards, none when all is clear."""
     if kind == "Bool":
-        return _encode(_new(FULL_NAMES["Bool"], data=pressed), kind, little_endian)
-    bump = _new(
+        return encode(new(FULL_NAMES["Bool"], data=pressed), kind, little_endian)
+    bump = new(
         "irobot_create_msgs/msg/HazardDetection",
-        header=_header(stamp_ns, "bump_front_center"),
+        header=header(stamp_ns, "bump_front_center"),
         type=BUMP,
     )
-    message = _new(
+    message = new(
         FULL_NAMES[kind],
-        header=_header(stamp_ns, "base_link"),
+        header=header(stamp_ns, "base_link"),
         detections=[bump] if pressed else [],
     )
-    return _encode(message, kind, little_endian)
+    return encode(message, kind, little_endian)
 
 
 def encode_battery(
@@ -298,19 +261,19 @@ def encode_battery(
 ) -> bytes:
     """State of a battery, what is unknown as not-a-number."""
     voltage = math.nan if battery.voltage_v is None else battery.voltage_v
-    header = _header(stamp_ns, "base_link")
+    head = header(stamp_ns, "base_link")
     if kind == "PowerReadings":
-        message = _new(
+        message = new(
             FULL_NAMES[kind],
-            header=header,
+            header=head,
             current=0.0,
             voltage=voltage,
             battery_low=battery.low,
         )
-        return _encode(message, kind, little_endian)
-    message = _new(
+        return encode(message, kind, little_endian)
+    message = new(
         FULL_NAMES[kind],
-        header=header,
+        header=head,
         voltage=voltage,
         temperature=math.nan,
         current=math.nan,
@@ -327,65 +290,15 @@ def encode_battery(
         location="",
         serial_number="",
     )
-    return _encode(message, kind, little_endian)
-
-
-def type_hash(kind: str) -> str:
-    """`RIHS01_...` of a type by its short name, as rmw_zenoh has it in its keys."""
-    return str(_store().hash_rihs01(FULL_NAMES[kind]))
-
-
-# ---------------------------------------------------------------- rosbags
-
-
-@functools.cache
-def _store() -> Any:
-    """All types, those of ROS and ours. Humble's and Jazzy's are equal here."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for name, text in _CUSTOM.items():
-        store.register(get_types_from_msg(text, name))
-    return store
-
-
-def _new(full_name: str, **fields: Any) -> Any:
-    return _store().types[full_name](**fields)
-
-
-def _encode(message: Any, kind: str, little_endian: bool) -> bytes:
-    return bytes(_store().serialize_cdr(message, FULL_NAMES[kind], little_endian=little_endian))
-
-
-def _decode(raw: bytes, kind: str) -> Any:
-    """A message whose bytes are those of its type, no more and no fewer but padding."""
-    if not raw:
-        raise BadMessage("empty")
-    if len(raw) > MAX_BYTES[kind]:
-        raise BadMessage(f"too long: {len(raw)} bytes, at most {MAX_BYTES[kind]}")
-    if len(raw) < 4 or raw[:2] not in _ENCAPSULATIONS:
-        raise BadMessage(f"unknown encapsulation: {raw[:4].hex()}")
-    try:
-        return _store().deserialize_cdr(raw, FULL_NAMES[kind])
-    except SerdeError as error:
-        raise BadMessage(f"truncated or of another type: {kind}: {error}") from error
-
-
-def _header(stamp_ns: int, frame_id: str) -> Any:
-    seconds, nanoseconds = divmod(stamp_ns, _S_NS)
-    stamp = _new("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
-    return _new("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
-
-
-def _stamp_ns(message: Any) -> int:
-    stamp = message.header.stamp
-    return int(stamp.sec) * _S_NS + int(stamp.nanosec)
+    return encode(message, kind, little_endian)
 
 
 def _twist(velocity: Velocity) -> Any:
     v3 = "geometry_msgs/msg/Vector3"
-    return _new(
+    return new(
         FULL_NAMES["Twist"],
-        linear=_new(v3, x=float(velocity.forward_m_s), y=float(velocity.left_m_s), z=0.0),
-        angular=_new(v3, x=0.0, y=0.0, z=float(velocity.turn_rad_s)),
+        linear=new(v3, x=float(velocity.forward_m_s), y=float(velocity.left_m_s), z=0.0),
+        angular=new(v3, x=0.0, y=0.0, z=float(velocity.turn_rad_s)),
     )
 
 

@@ -16,11 +16,11 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Literal, cast
 
-from services.robot_driver.real import cdr, ros2_names
-from services.robot_driver.real.cdr import VelocityType
+from services.robot_driver.real import cdr, ros2_names, ros2_types
 from services.robot_driver.real.freshness import Pictures, Sequences, Stamps
 from services.robot_driver.real.link import Battery, Newest
 from services.robot_driver.real.ros2_names import Attachment, Endpoint
+from services.robot_driver.real.ros2_types import VelocityType
 from services.robot_driver.robot import Pose, RobotFault, Velocity
 from shared.config import Config
 from shared.errors import BadMessage, RouterMissing
@@ -102,7 +102,7 @@ class Ros2Link:
                     self._inbox,
                     name,
                     self._key(name, kind, ros2_names.ANY_HASH),
-                    max_bytes=cdr.MAX_BYTES[kind],
+                    max_bytes=ros2_types.MAX_BYTES[kind],
                     keep=KEPT[name],
                 )
         for kind in ros2_names.VELOCITY_TYPES:
@@ -161,13 +161,13 @@ class Ros2Link:
     def _hash(self, kind: str) -> str:
         if self._ros.distribution == "humble":
             return ros2_names.NO_HASH
-        return cdr.type_hash(kind)
+        return ros2_types.type_hash(kind)
 
     def _key(self, name: str, kind: str, type_hash: str) -> str:
         topic = self._topics[name]
         if self._ros.transport == "bridge":
             return topic
-        return ros2_names.rmw_key(self._ros.domain, topic, cdr.FULL_NAMES[kind], type_hash)
+        return ros2_names.rmw_key(self._ros.domain, topic, ros2_types.FULL_NAMES[kind], type_hash)
 
     def _velocity_type(self) -> tuple[VelocityType, str]:
         """Which type to send (empty: unknown), and what speaks against sending."""
@@ -187,7 +187,7 @@ class Ros2Link:
         """A sensor that the robot publishes as another type; what it sends would mean nothing."""
         for name, topic in self._topics.items():
             told = ros2_names.types_on(self._endpoints, "publishes", topic)
-            if name != "velocity" and told and cdr.FULL_NAMES[self._kinds[name]] not in told:
+            if name != "velocity" and told and ros2_types.FULL_NAMES[self._kinds[name]] not in told:
                 types = " and ".join(sorted(ros2_names.short(full) for full in told))
                 return f"robot publishes {types} on {topic}, configured {self._kinds[name]}"
         return ""

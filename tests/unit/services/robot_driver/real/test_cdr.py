@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.robot_driver.real import cdr
+from services.robot_driver.real import cdr, ros2_types
 from services.robot_driver.real.link import Battery
 from services.robot_driver.robot import Pose, Velocity
 from shared.errors import BadMessage
@@ -89,7 +89,7 @@ def test_odometry_has_the_known_length() -> None:
     ],
 )
 def test_types_have_the_known_hashes(kind: str, known: str) -> None:
-    assert cdr.type_hash(kind) == f"RIHS01_{known}"
+    assert ros2_types.type_hash(kind) == f"RIHS01_{known}"
 
 
 # ---------------------------------------------------------------- against an independent codec
@@ -329,7 +329,7 @@ def test_empty_and_huge_payloads_are_refused_unread(kind: str) -> None:
     with pytest.raises(BadMessage, match=r"^empty"):
         DECODERS[kind](b"")
     with pytest.raises(BadMessage, match=r"^too long"):
-        DECODERS[kind](sound(kind) + bytes(cdr.MAX_BYTES[kind]))
+        DECODERS[kind](sound(kind) + bytes(ros2_types.MAX_BYTES[kind]))
 
 
 @pytest.mark.parametrize("kind", sorted(DECODERS))

@@ -1,0 +1,116 @@
+"""The ROS 2 message types that a robot is driven with, and their CDR, without a ROS installation.
+
+The only file that imports rosbags. Before bytes are decoded their size and encapsulation are
+checked. Stamps are nanoseconds of the robot's clock; 0: none told.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, Literal
+
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from shared.errors import BadMessage
+
+VelocityType = Literal["Twist", "TwistStamped"]
+CameraType = Literal["Image", "CompressedImage"]
+BumperType = Literal["Bool", "HazardDetectionVector"]
+BatteryType = Literal["BatteryState", "PowerReadings"]
+
+FULL_NAMES = {
+    "Twist": "geometry_msgs/msg/Twist",
+    "TwistStamped": "geometry_msgs/msg/TwistStamped",
+    "Odometry": "nav_msgs/msg/Odometry",
+    "Image": "sensor_msgs/msg/Image",
+    "CompressedImage": "sensor_msgs/msg/CompressedImage",
+    "Bool": "std_msgs/msg/Bool",
+    "HazardDetectionVector": "irobot_create_msgs/msg/HazardDetectionVector",
+    "BatteryState": "sensor_msgs/msg/BatteryState",
+    "PowerReadings": "rto_msgs/msg/PowerReadings",
+}
+"""By short name, the types a robot is driven with."""
+
+KIB = 1024
+MAX_BYTES = {
+    "Twist": 4 * KIB,
+    "TwistStamped": 4 * KIB,
+    "Odometry": 16 * KIB,
+    "Image": 3 * 2048 * 2048 + 4 * KIB,
+    "CompressedImage": 4 * KIB * KIB,
+    "Bool": 64,
+    "HazardDetectionVector": 64 * KIB,
+    "BatteryState": 16 * KIB,
+    "PowerReadings": 4 * KIB,
+}
+"""Longest payload of each type; longer ones are refused unread."""
+
+# Fields of the types that do not come with ROS itself.
+_CUSTOM = {
+    "irobot_create_msgs/msg/HazardDetection": "std_msgs/Header header\nuint8 type\n",
+    "irobot_create_msgs/msg/HazardDetectionVector": (
+        "std_msgs/Header header\nirobot_create_msgs/HazardDetection[] detections\n"
+    ),
+    "rto_msgs/msg/PowerReadings": (
+        "std_msgs/Header header\nfloat32 current\nfloat32 voltage\nbool battery_low\n"
+    ),
+}
+
+_ENCAPSULATIONS = (b"\x00\x00", b"\x00\x01")
+"""CDR, big and little endian; what follows are options that mean nothing."""
+_S_NS = 1_000_000_000
+
+
+def type_hash(kind: str) -> str:
+    """`RIHS01_...` of a type by its short name, as rmw_zenoh has it in its keys."""
+    return str(_store().hash_rihs01(FULL_NAMES[kind]))
+
+
+@functools.cache
+def _store() -> Any:
+    """All types, those of ROS and ours. Humble's and Jazzy's are equal here."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, text in _CUSTOM.items():
+        store.register(get_types_from_msg(text, name))
+    return store
+
+
+def new(full_name: str, **fields: Any) -> Any:
+    """A message of a type, by its full name."""
+    return _store().types[full_name](**fields)
+
+
+def encode(message: Any, kind: str, little_endian: bool) -> bytes:
+    """CDR of a message; kind: short name of its type."""
+    return bytes(_store().serialize_cdr(message, FULL_NAMES[kind], little_endian=little_endian))
+
+
+def decode(raw: bytes, kind: str) -> Any:
+    """The message in CDR bytes; kind: short name of its type.
+
+    Raises BadMessage unless they are the bytes of that type, no more and no fewer but padding.
+    """
+    if not raw:
+        raise BadMessage("empty")
+    if len(raw) > MAX_BYTES[kind]:
+        raise BadMessage(f"too long: {len(raw)} bytes, at most {MAX_BYTES[kind]}")
+    if len(raw) < 4 or raw[:2] not in _ENCAPSULATIONS:
+        raise BadMessage(f"unknown encapsulation: {raw[:4].hex()}")
+    try:
+        return _store().deserialize_cdr(raw, FULL_NAMES[kind])
+    except SerdeError as error:
+        raise BadMessage(f"truncated or of another type: {kind}: {error}") from error
+
+
+def header(stamp_ns: int, frame_id: str) -> Any:
+    """A message's header."""
+    seconds, nanoseconds = divmod(stamp_ns, _S_NS)
+    stamp = new("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+    return new("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+
+
+def stamp_ns_of(message: Any) -> int:
+    """The stamp in a message's header."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * _S_NS + int(stamp.nanosec)
