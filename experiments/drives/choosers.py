@@ -9,7 +9,8 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from services.robot_driver.atlas.planner import Motion, Planner
+from services.robot_driver.atlas.action_geometry import ActionGeometry
+from services.robot_driver.atlas.planner import Planner
 from services.robot_driver.simulated.world import World
 from shared.config import PolicyConfig, RobotConfig
 from shared.messages import Observation, image_array
@@ -60,7 +61,7 @@ class Planned:
 
     def __init__(self, world: World, robot: RobotConfig) -> None:
         self._planner = Planner(
-            world, Motion.of(robot), cell_m=GRID_M, headings=HEADINGS, horizon=HORIZON
+            world, ActionGeometry.of(robot), cell_m=GRID_M, headings=HEADINGS, horizon=HORIZON
         )
         self._actions: list[int] = []
         self._places: list[npt.NDArray[np.float64]] = []

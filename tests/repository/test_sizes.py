@@ -14,10 +14,7 @@ LONGEST_FUNCTION = 40
 LONGEST_FILE = 350
 TABLES = {"shared/messages.py", "shared/config.py"}
 """Tables: longer on purpose, one row after the other."""
-LONG_FILES = {
-    "services/robot_driver/atlas/planner.py": 387,
-    "services/robot_driver/real/cdr.py": 393,
-}
+LONG_FILES: dict[str, int] = {}
 """Files still to be cut, with the length that they must not exceed meanwhile."""
 LONG_FUNCTIONS = {"drive_tour": 59, "run_experiment": 48}
 """Functions still to be cut, likewise."""

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from services.robot_driver.atlas.planner import CONTACT_M, Motion
+from services.robot_driver.atlas.action_geometry import CONTACT_M, ActionGeometry
 from services.robot_driver.simulated.scene import WALL_THICKNESS_M
 from services.robot_driver.simulated.sim import SUBSTEP_M
 from services.robot_driver.simulated.world import Fixture, Floats, World
@@ -26,7 +26,7 @@ _SMALL_M2 = 0.05
 """Smaller parts that cannot be reached are corners, not rooms."""
 
 
-def problems(world: World, motion: Motion) -> list[str]:
+def problems(world: World, geometry: ActionGeometry) -> list[str]:
     """One line for each problem, none if a robot can be let loose in this world.
 
     Loops that cross are reported alone: without an inside and an outside nothing else has meaning.
@@ -34,7 +34,7 @@ def problems(world: World, motion: Motion) -> list[str]:
     loops = [*_crossings(world), *_misplaced(world)]
     if loops:
         return loops
-    return [*_thin_walls(world, motion), *_unreachable(world, motion), *_looks(world)]
+    return [*_thin_walls(world, geometry), *_unreachable(world, geometry), *_looks(world)]
 
 
 # ---------------------------------------------------------------- loops
@@ -156,35 +156,35 @@ def _crossing(a: Floats, b: Floats) -> tuple[npt.NDArray[np.bool_], Floats]:
 # ---------------------------------------------------------------- walls
 
 
-def _thin_walls(world: World, motion: Motion) -> list[str]:
+def _thin_walls(world: World, geometry: ActionGeometry) -> list[str]:
     """Walls between two free sides that are thinner than motion or simulation can bear."""
     names, pairs, lines = _named(world), _pairs(world), []
     solid = ~world.between_walls(pairs.middles)
-    for k in np.flatnonzero(solid & (pairs.gaps_m < motion.step_m - 1e-9)):
+    for k in np.flatnonzero(solid & (pairs.gaps_m < geometry.step_m - 1e-9)):
         (x, y), gap = pairs.middles[k], pairs.gaps_m[k]
         lines.append(
             f"walls: {names[pairs.first[k]]} and {names[pairs.second[k]]} are {gap:.3f} m apart at "
-            f"({x:.2f}, {y:.2f}), thinner than {_thinner_than(gap, motion)}"
+            f"({x:.2f}, {y:.2f}), thinner than {_thinner_than(gap, geometry)}"
         )
     return lines
 
 
-def _thinner_than(gap_m: float, motion: Motion) -> str:
+def _thinner_than(gap_m: float, geometry: ActionGeometry) -> str:
     if gap_m < SUBSTEP_M:
         return f"one step of the simulation ({SUBSTEP_M} m): a robot can get through"
     if gap_m < WALL_THICKNESS_M:
         return f"the solid behind each wall ({WALL_THICKNESS_M} m), which would stand in the way"
-    return f"one action is long ({motion.step_m:.2f} m)"
+    return f"one action is long ({geometry.step_m:.2f} m)"
 
 
 # ---------------------------------------------------------------- reach
 
 
-def _unreachable(world: World, motion: Motion) -> list[str]:
+def _unreachable(world: World, geometry: ActionGeometry) -> list[str]:
     """Starts in contact, starts and places that cannot be reached, parts nobody can enter."""
     lines, starts = [], []
     for i, start in enumerate(world.starts):
-        gap = float(world.clearance(np.array([[start.x_m, start.y_m]]))[0]) - motion.radius_m
+        gap = float(world.clearance(np.array([[start.x_m, start.y_m]]))[0]) - geometry.radius_m
         at = f"starts.{i}: ({start.x_m:g}, {start.y_m:g})"
         if gap <= CONTACT_M:
             lines.append(f"{at} touches a wall or an obstacle (gap {gap:.3f} m)")
@@ -192,12 +192,12 @@ def _unreachable(world: World, motion: Motion) -> list[str]:
             starts.append((i, at, start.x_m, start.y_m))
     if not starts:
         return lines
-    parts = Reach.of(world, motion.radius_m)
+    parts = Reach.of(world, geometry.radius_m)
     first, _, x, y = starts[0]
     home = parts.part_of(x, y)
     for _, at, x, y in starts:
         here = parts.part_of(x, y)
-        if parts.size_m(here) < motion.step_m:
+        if parts.size_m(here) < geometry.step_m:
             lines.append(f"{at} is shut in: there is no room for one action")
         elif here != home:
             lines.append(f"{at} cannot be reached from starts.{first}")

@@ -13,26 +13,16 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
+from services.robot_driver.atlas.action_geometry import CONTACT_M, ActionGeometry, Floats
+from services.robot_driver.atlas.pose_grid import PoseGrid, Table
 from services.robot_driver.simulated.world import World
-from shared.config import RobotConfig
-from shared.facts import ACTION_COUNT, ACTIONS
+from shared.facts import ACTION_COUNT
 
-Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-Table = npt.NDArray[np.float32]
-"""float32 [headings, rows, columns]: rows run along y, columns along x, from the lower corner."""
 
-TURNS = tuple(float(action.turn) for action in ACTIONS)
-"""Turn of every action in units of the turn rate."""
-CONTACT_M = 0.001
-"""Gap to a wall that counts as contact, as in the simulation."""
-_EXACT_STEP_M = 0.01
-_TABLE_STEPS = 5
-"""Points at which the tables look at the way of one action."""
 _DISCOUNT = 0.99
 _SWEEPS = 250
 _ARRIVAL_M = 1.0
@@ -46,45 +36,7 @@ _LOST = -100.0
 
 
 @dataclass(frozen=True)
-class Motion:
-    """The three actions and the round shell, as far as geometry is concerned."""
-
-    step_m: float
-    """Forward way of one action."""
-    turn_rad: float
-    """Turn of one turning action."""
-    radius_m: float
-
-    @classmethod
-    def of(cls, config: RobotConfig) -> Motion:
-        """The motion of a configured robot."""
-        period = config.period_s
-        return cls(config.speed_m_s * period, config.turn_rad_s * period, config.radius_m)
-
-    @property
-    def turning_radius_m(self) -> float:
-        """Radius of the arc that a turning action drives."""
-        return self.step_m / self.turn_rad
-
-    def move(self, poses: Floats, action: int, part: float = 1.0) -> Floats:
-        """Where part of an action leads: float64 [n, 3] of x, y, heading to the same."""
-        half = TURNS[action] * self.turn_rad * part / 2.0
-        chord = self.step_m * part * (math.sin(half) / half if half else 1.0)
-        heading = poses[:, 2] + half
-        x = poses[:, 0] + chord * np.cos(heading)
-        y = poses[:, 1] + chord * np.sin(heading)
-        return np.column_stack([x, y, heading + half])
-
-    def gap(self, world: World, poses: Floats, action: int) -> Floats:
-        """Least gap to a wall on the way of one action, looked at every centimetre; float64 [n]."""
-        steps = math.ceil(self.step_m / _EXACT_STEP_M - 1e-9)
-        way = [self.move(poses, action, (i + 1) / steps)[:, :2] for i in range(steps)]
-        gaps = world.clearance(np.vstack(way)).reshape(steps, len(poses))
-        return np.asarray(gaps.min(axis=0)) - self.radius_m
-
-
-@dataclass(frozen=True)
-class Run:
+class PlannedRuns:
     """Planned runs from n poses."""
 
     survived: Ints
@@ -112,11 +64,11 @@ class _Aim:
 
 
 class Planner:
-    """Tables for one world and one motion.
+    """Tables for one world and one robot.
 
     Args:
         world: The map.
-        motion: The three actions.
+        geometry: Of the three actions.
         cell_m: Grid distance of positions.
         headings: Number of grid headings.
         horizon: Actions a saved run lasts.
@@ -125,32 +77,29 @@ class Planner:
     def __init__(
         self,
         world: World,
-        motion: Motion,
+        geometry: ActionGeometry,
         *,
         cell_m: float = 0.05,
         headings: int = 48,
         horizon: int = 500,
     ) -> None:
         self.world = world
-        self.motion = motion
-        self._cell_m = cell_m
-        self._headings = headings
-        x0, y0, x1, y1 = world.bounds
-        self._origin = np.array([x0, y0])
-        columns, rows = math.ceil((x1 - x0) / cell_m) + 1, math.ceil((y1 - y0) / cell_m) + 1
-        y, x = np.mgrid[0:rows, 0:columns] * cell_m
-        self._points = np.column_stack([x.ravel() + x0, y.ravel() + y0])
-        room = world.clearance(self._points) - motion.radius_m
-        self._room: Table = room.reshape(rows, columns).astype(np.float32)
-        self._way = [self._way_room(action) for action in range(ACTION_COUNT)]
+        self.geometry = geometry
+        self._grid = PoseGrid(world.bounds, geometry, cell_m, headings)
+        room = world.clearance(self._grid.points) - geometry.radius_m
+        self._room = room.reshape(self._grid.shape).astype(np.float32)
+        """float32 [rows, columns]: gap to a wall at every position."""
+        self._way = [self._grid.least_on_way(self._room, a) for a in range(ACTION_COUNT)]
         self._margin = self._margin_table(horizon)
         self._aims: dict[tuple[int, float], _Aim] = {}
 
-    def drive(self, poses: Floats, actions: int) -> Run:
+    def drive(self, poses: Floats, actions: int) -> PlannedRuns:
         """Planned runs that keep most room, from poses float64 [n, 3]."""
         return self._roll_out(poses, actions, None)
 
-    def race(self, pose: Floats, actions: int, direction: int, keep_m: float = 0.005) -> Run:
+    def race(
+        self, pose: Floats, actions: int, direction: int, keep_m: float = 0.005
+    ) -> PlannedRuns:
         """The planned run from one pose [3] with most net angle round the lap centre.
 
         Where the room to keep cannot be kept, it makes for more room first.
@@ -170,7 +119,7 @@ class Planner:
 
         return self._pursue(pose, actions, (direction, keep_m), turned)
 
-    def tour(self, actions: int, keep_m: float = 0.005) -> Run:
+    def tour(self, actions: int, keep_m: float = 0.005) -> PlannedRuns:
         """The planned run along the world's route, from its first point towards its second.
 
         Args:
@@ -211,14 +160,16 @@ class Planner:
         angle = np.unwrap(self._bearing(poses))
         return np.asarray(angle - angle[0])
 
-    def _pursue(self, pose: Floats, actions: int, key: tuple[int, float], gain: Gain) -> Run:
+    def _pursue(
+        self, pose: Floats, actions: int, key: tuple[int, float], gain: Gain
+    ) -> PlannedRuns:
         """A run for gain; the key is its direction, 0 along the route, and the room to keep."""
         if key not in self._aims:
             keep_m = key[1]
             self._aims[key] = _Aim(gain, keep_m, self._gain_table(gain, keep_m))
         return self._roll_out(pose[None, :], actions, self._aims[key])
 
-    def _roll_out(self, poses: Floats, actions: int, aim: _Aim | None) -> Run:
+    def _roll_out(self, poses: Floats, actions: int, aim: _Aim | None) -> PlannedRuns:
         poses = poses.copy()
         survived = np.zeros(len(poses), np.int64)
         alive = np.arange(len(poses))
@@ -229,36 +180,38 @@ class Planner:
             safe = np.zeros(len(poses), np.bool_)
             for action in range(ACTION_COUNT):
                 mine = alive[chosen[alive] == action]
-                safe[mine] = self.motion.gap(self.world, poses[mine], action) > CONTACT_M
-                poses[mine] = self.motion.move(poses[mine], action)
+                safe[mine] = self.geometry.gap(self.world, poses[mine], action) > CONTACT_M
+                poses[mine] = self.geometry.move(poses[mine], action)
             alive = alive[safe[alive]]
             survived[alive] += 1
             chosen_all.append(chosen)
             poses_all.append(poses.copy())
             if not len(alive):
                 break
-        return Run(survived, np.array(chosen_all, np.int64), np.array(poses_all))
+        return PlannedRuns(survived, np.array(chosen_all, np.int64), np.array(poses_all))
 
     def _choose(self, poses: Floats, aim: _Aim | None) -> Ints:
         """The action with most room on its way and after it, or with most progress if safe."""
         scores = []
         for action in range(ACTION_COUNT):
-            after = self.motion.move(poses, action)
+            after = self.geometry.move(poses, action)
             room = np.minimum(
-                self._look_up(self._way[action], poses), self._look_up(self._margin, after)
+                self._grid.look_up(self._way[action], poses),
+                self._grid.look_up(self._margin, after),
             )
             if aim is not None:
-                value = aim.gain(poses, after) + _DISCOUNT * self._look_up(aim.table, after)
+                value = aim.gain(poses, after) + _DISCOUNT * self._grid.look_up(aim.table, after)
                 room = np.where(room > aim.keep_m, value, room - 100.0)
             scores.append(room)
         return np.asarray(np.argmax(np.stack(scores), axis=0), np.int64)
 
     def _margin_table(self, horizon: int) -> Table:
         """Room kept at the narrowest place of the best run of `horizon` actions."""
-        table = np.repeat(self._room[None], self._headings, axis=0)
+        table = np.repeat(self._room[None], self._grid.headings, axis=0)
         for _ in range(horizon):
             best = [
-                np.minimum(self._way[a], self._after(table, a, -1.0)) for a in range(ACTION_COUNT)
+                np.minimum(self._way[a], self._grid.after(table, a, -1.0))
+                for a in range(ACTION_COUNT)
             ]
             new = np.minimum(table, np.maximum.reduce(best))
             if np.array_equal(new, table):
@@ -268,19 +221,21 @@ class Planner:
 
     def _gain_table(self, gain: Gain, keep_m: float) -> Table:
         """Discounted gain of the best safe run."""
-        before = np.column_stack([self._points, np.zeros(len(self._points))])
+        before = np.column_stack([self._grid.points, np.zeros(len(self._grid.points))])
         gains = []
         for action in range(ACTION_COUNT):
             table = np.empty_like(self._margin)
-            for h in range(self._headings):
-                before[:, 2] = h * self._heading_step
-                after = self.motion.move(before, action)
-                table[h] = gain(before, after).reshape(self._room.shape)
-            room = np.minimum(self._way[action], self._after(self._margin, action, -1.0))
+            for h in range(self._grid.headings):
+                before[:, 2] = h * self._grid.heading_step
+                after = self.geometry.move(before, action)
+                table[h] = gain(before, after).reshape(self._grid.shape)
+            room = np.minimum(self._way[action], self._grid.after(self._margin, action, -1.0))
             gains.append(np.where(room > keep_m, table, np.float32(-np.inf)))
         table = np.zeros_like(self._margin)
         for _ in range(_SWEEPS):
-            best = [gains[a] + _DISCOUNT * self._after(table, a, 0.0) for a in range(ACTION_COUNT)]
+            best = [
+                gains[a] + _DISCOUNT * self._grid.after(table, a, 0.0) for a in range(ACTION_COUNT)
+            ]
             table = np.maximum(np.maximum.reduce(best), np.float32(_LOST))
         return table
 
@@ -289,75 +244,11 @@ class Planner:
             raise ValueError(f"world {self.world.name!r} has no route")
         return _Track(np.array(self.world.route.points, np.float64))
 
-    @property
-    def _heading_step(self) -> float:
-        return 2.0 * math.pi / self._headings
-
     def _bearing(self, poses: Floats) -> Floats:
         if self.world.lap is None:
             raise ValueError(f"world {self.world.name!r} has no lap centre")
         cx, cy = self.world.lap.centre
         return np.asarray(np.arctan2(poses[:, 1] - cy, poses[:, 0] - cx))
-
-    def _way_room(self, action: int) -> Table:
-        """Least room on the way of one action from each grid pose."""
-        parts = [(i + 1) / _TABLE_STEPS for i in range(_TABLE_STEPS)]
-        return np.stack(
-            [
-                np.minimum.reduce([self._shift(self._room, h, action, p, -1.0) for p in parts])
-                for h in range(self._headings)
-            ]
-        )
-
-    def _after(self, table: Table, action: int, outside: float) -> Table:
-        """The table's values where one action leads from each grid pose, interpolated."""
-        turn = TURNS[action] * self.motion.turn_rad / self._heading_step
-        low = math.floor(turn + 1e-9)
-        part = np.float32(turn - low) if turn - low > 1e-9 else np.float32(0.0)
-        ahead = np.roll(table, -low, axis=0)
-        if part:
-            ahead = (1 - part) * ahead + part * np.roll(table, -low - 1, axis=0)
-        return np.stack(
-            [self._shift(ahead[h], h, action, 1.0, outside) for h in range(self._headings)]
-        )
-
-    def _shift(self, plane: Table, h: int, action: int, part: float, outside: float) -> Table:
-        """One heading's plane, read at the place where part of an action leads."""
-        there = self.motion.move(np.array([[0.0, 0.0, h * self._heading_step]]), action, part)[0]
-        dx, dy = there[0] / self._cell_m, there[1] / self._cell_m
-        return np.asarray(
-            cv2.warpAffine(
-                plane,
-                np.array([[1.0, 0.0, dx], [0.0, 1.0, dy]]),
-                (plane.shape[1], plane.shape[0]),
-                flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-                borderMode=cv2.BORDER_CONSTANT,
-                borderValue=(outside,),
-            ),
-            np.float32,
-        )
-
-    def _look_up(self, table: Table, poses: Floats) -> Floats:
-        """Interpolated values of a table at float64 [n, 3], float64 [n]; grid edges repeat."""
-        rows, columns = self._room.shape
-        grid = (poses[:, :2] - self._origin) / self._cell_m
-        x = np.clip(grid[:, 0], 0.0, columns - 1.001)
-        y = np.clip(grid[:, 1], 0.0, rows - 1.001)
-        h = np.remainder(poses[:, 2] / self._heading_step, self._headings)
-        result = np.zeros(len(poses))
-        for dh in (0, 1):
-            for dy in (0, 1):
-                for dx in (0, 1):
-                    weight = np.ones(len(poses))
-                    for value, far in ((h, dh), (y, dy), (x, dx)):
-                        rest = value - np.floor(value)
-                        weight *= rest if far else 1.0 - rest
-                    result += weight * table[
-                        (np.floor(h).astype(np.int64) + dh) % self._headings,
-                        np.floor(y).astype(np.int64) + dy,
-                        np.floor(x).astype(np.int64) + dx,
-                    ]  # fmt: skip
-        return result
 
 
 @dataclass(frozen=True)

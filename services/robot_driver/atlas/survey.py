@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from services.robot_driver.atlas.action_geometry import TURNS, ActionGeometry
 from services.robot_driver.atlas.inspection import problems
-from services.robot_driver.atlas.planner import TURNS, Motion, Planner
+from services.robot_driver.atlas.planner import Planner
 from services.robot_driver.recovery import back_off
 from services.robot_driver.robot import Pose, Velocity
 from services.robot_driver.simulated.sim import SimRobot
@@ -58,7 +59,7 @@ def problems_in(path: Path, config: Config) -> list[str]:
         world = read_world(path)
     except WorldError as error:
         return [str(error)]
-    return problems(world, Motion.of(config.robot))
+    return problems(world, ActionGeometry.of(config.robot))
 
 
 def survey(config: Config, world: World) -> Figures:
@@ -68,20 +69,20 @@ def survey(config: Config, world: World) -> Figures:
         Named figures: lengths in metres, angles in degrees, times in milliseconds.
 
     """
-    motion = Motion.of(config.robot)
+    geometry = ActionGeometry.of(config.robot)
     robot = SimRobot(config.robot, world, config.run.seed)
     try:
         driven = drive_randomly(robot, _RECOVERIES, config.run.seed)
         pictures = _render_times(robot)
     finally:
         robot.close()
-    planner = Planner(world, motion, horizon=PLANNED_ACTIONS)
+    planner = Planner(world, geometry, horizon=PLANNED_ACTIONS)
     return {
         "world": world.name,
-        **_geometry(world, motion),
+        **_geometry(world, geometry),
         **_best_run(planner),
         **_laps(planner),
-        **_tour(world, motion),
+        **_tour(world, geometry),
         **_random_figures(driven),
         **_saved(planner, driven),
         **pictures,
@@ -131,15 +132,15 @@ def _widths(world: World, segment: npt.NDArray[np.float64]) -> npt.NDArray[np.fl
     return np.where(bare, far, np.inf)
 
 
-def _geometry(world: World, motion: Motion) -> Figures:
+def _geometry(world: World, geometry: ActionGeometry) -> Figures:
     width = corridor_width(world)
-    circle = motion.turning_radius_m + motion.radius_m
+    circle = geometry.turning_radius_m + geometry.radius_m
     x0, y0, x1, y1 = world.bounds
     grid = np.mgrid[x0:x1:0.05, y0:y1:0.05].reshape(2, -1).T
     return {
-        "step_m": motion.step_m,
-        "turn_per_action_deg": math.degrees(motion.turn_rad),
-        "turning_radius_m": motion.turning_radius_m,
+        "step_m": geometry.step_m,
+        "turn_per_action_deg": math.degrees(geometry.turn_rad),
+        "turning_radius_m": geometry.turning_radius_m,
         "corridor_width_m": width,
         "full_circle_needs_width_m": 2.0 * circle,
         "full_circle_fits_narrowest_part": 2.0 * circle < width,
@@ -160,7 +161,7 @@ def _laps(planner: Planner) -> Figures:
     if len(world.walls) == 2:
         middle = _centre_line_lap(world)
         figures["centre_line_lap_m"] = middle
-        figures["centre_line_lap_actions"] = middle / planner.motion.step_m
+        figures["centre_line_lap_actions"] = middle / planner.geometry.step_m
     for name, direction, keep in (
         ("fastest_lap_left_actions", 1, 0.005),
         ("fastest_lap_right_actions", -1, 0.005),
@@ -182,14 +183,14 @@ def _actions_per_lap(
     return survived / laps if laps > 0.5 else math.inf
 
 
-def _tour(world: World, motion: Motion) -> Figures:
+def _tour(world: World, geometry: ActionGeometry) -> Figures:
     """How much of the route a planned run drives, and in how many actions."""
     if world.route is None:
         return {}
     # A dead end may end the route, so the run need not be able to go on for ever.
-    planner = Planner(world, motion, horizon=_TOUR_HORIZON)
+    planner = Planner(world, geometry, horizon=_TOUR_HORIZON)
     length = world.route.length_m
-    run = planner.tour(round(2.0 * length / motion.step_m))
+    run = planner.tour(round(2.0 * length / geometry.step_m))
     driven = planner.progress(run.poses[: int(run.survived[0]) + 1, 0])
     return {
         "route_m": length,

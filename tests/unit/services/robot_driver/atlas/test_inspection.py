@@ -11,12 +11,12 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from services.robot_driver.atlas.action_geometry import ActionGeometry
 from services.robot_driver.atlas.inspection import Reach, problems
-from services.robot_driver.atlas.planner import Motion
 from services.robot_driver.simulated.world import World
 from shared.config import RobotConfig
 
-MOTION = Motion.of(RobotConfig())
+GEOMETRY = ActionGeometry.of(RobotConfig())
 ROOM = [(0.0, 0.0), (6.0, 0.0), (6.0, 4.0), (0.0, 4.0)]
 Loop = list[tuple[float, float]]
 
@@ -55,7 +55,7 @@ def start(x: float, y: float) -> dict[str, float]:
 
 
 def found(*loops: Loop, **more: Any) -> str:
-    lines = problems(world(*loops, **more), MOTION)
+    lines = problems(world(*loops, **more), GEOMETRY)
     assert all("\n" not in line for line in lines)
     return "\n".join(lines)
 
@@ -94,7 +94,7 @@ def test_an_island_anywhere_meets_the_boundary_exactly_if_it_lies_on_both_sides(
     line = np.vstack([a + part * (b - a) for a, b in itertools.pairwise(corners)])
     depth = np.minimum.reduce([line[:, 0], 6.0 - line[:, 0], line[:, 1], 4.0 - line[:, 1]])
     assume(min(abs(depth.min()), abs(depth.max()), abs(depth[0])) > 0.01)  # too close to call
-    lines = problems(world(ROOM, island), MOTION)
+    lines = problems(world(ROOM, island), GEOMETRY)
     assert any("meet at" in line for line in lines) == (depth.min() < 0.0 < depth.max())
     assert any("outside the boundary" in line for line in lines) == bool(depth[0] < 0.0)
 

@@ -6,7 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from services.robot_driver.atlas.planner import CONTACT_M, Motion, Planner
+from services.robot_driver.atlas.action_geometry import CONTACT_M, ActionGeometry
+from services.robot_driver.atlas.planner import Planner
 from services.robot_driver.atlas.survey import corridor_width, drive_randomly
 from services.robot_driver.robot import Pose, Velocity
 from services.robot_driver.simulated.kinematics import advance
@@ -15,7 +16,7 @@ from services.robot_driver.simulated.world import World, load_world
 from shared.config import RobotConfig
 
 CONFIG = RobotConfig()
-MOTION = Motion.of(CONFIG)
+GEOMETRY = ActionGeometry.of(CONFIG)
 ACTIONS = [Velocity(CONFIG.speed_m_s, 0.0, turn * CONFIG.turn_rad_s) for turn in (0.0, 1.0, -1.0)]
 
 
@@ -40,7 +41,7 @@ def random_poses(world: World, count: int, seed: int) -> np.ndarray:
     draw = np.random.default_rng(seed)
     x0, y0, x1, y1 = world.bounds
     points = draw.uniform((x0, y0), (x1, y1), (50 * count, 2))
-    points = points[world.clearance(points) > MOTION.radius_m + 0.01][:count]
+    points = points[world.clearance(points) > GEOMETRY.radius_m + 0.01][:count]
     return np.column_stack([points, draw.uniform(-math.pi, math.pi, len(points))])
 
 
@@ -49,8 +50,8 @@ def longest_by_brute_force(world: World, poses: np.ndarray, depth: int) -> np.nd
     best = np.zeros(len(poses), np.int64)
     origin, here = np.arange(len(poses)), poses
     for k in range(1, depth + 1):
-        safe = [MOTION.gap(world, here, action) > CONTACT_M for action in range(3)]
-        moved = [MOTION.move(here, action) for action in range(3)]
+        safe = [GEOMETRY.gap(world, here, action) > CONTACT_M for action in range(3)]
+        moved = [GEOMETRY.move(here, action) for action in range(3)]
         here = np.vstack([m[s] for m, s in zip(moved, safe, strict=True)])
         origin = np.hstack([origin[s] for s in safe])
         best[origin] = k
@@ -62,7 +63,7 @@ def test_plans_agree_with_all_sequences_in_a_room_just_large_enough_to_circle_in
     world, depth = room(1.9, 1.7), 8
     poses = random_poses(world, 60, 1)
     possible = longest_by_brute_force(world, poses, depth) == depth
-    planner = Planner(world, MOTION, cell_m=0.02, headings=72, horizon=60)
+    planner = Planner(world, GEOMETRY, cell_m=0.02, headings=72, horizon=60)
     planned = planner.drive(poses, 60)
     assert np.all(possible[planned.survived >= depth])
     assert 0.2 < possible.mean() < 0.8
@@ -71,16 +72,16 @@ def test_plans_agree_with_all_sequences_in_a_room_just_large_enough_to_circle_in
 
 def test_in_a_large_room_nearly_every_pose_off_the_walls_is_saved_and_none_at_a_wall_head_on():
     world = room(6.0, 6.0)
-    planner = Planner(world, MOTION, cell_m=0.1, headings=36, horizon=100)
+    planner = Planner(world, GEOMETRY, cell_m=0.1, headings=36, horizon=100)
     middle = np.array([[3.0, 3.0, 0.3]])
-    head_on = np.array([[6.0 - MOTION.radius_m - 0.2, 3.0, 0.0]])
+    head_on = np.array([[6.0 - GEOMETRY.radius_m - 0.2, 3.0, 0.0]])
     assert planner.drive(middle, 200).survived[0] == 200
     assert planner.drive(head_on, 200).survived[0] < 3
 
 
 @pytest.fixture(scope="module")
 def plus() -> Planner:
-    return Planner(load_world("plus"), MOTION, cell_m=0.1, headings=36, horizon=60)
+    return Planner(load_world("plus"), GEOMETRY, cell_m=0.1, headings=36, horizon=60)
 
 
 def test_planned_runs_are_driven_by_the_simulated_robot_without_contact(plus: Planner):
@@ -112,7 +113,7 @@ def test_planned_laps_go_round_in_either_direction(plus: Planner):
 def test_motion_is_that_of_the_simulated_robot():
     poses = random_poses(room(4.0, 4.0), 20, 3)
     for action, part in itertools.product(range(3), (0.3, 1.0)):
-        moved = MOTION.move(poses, action, part)
+        moved = GEOMETRY.move(poses, action, part)
         for (x, y, h), after in zip(poses, moved, strict=True):
             exact = advance(
                 Pose(float(x), float(y), float(h)), ACTIONS[action], CONFIG.period_s * part
@@ -122,7 +123,7 @@ def test_motion_is_that_of_the_simulated_robot():
 
 
 def test_worlds_without_lap_centre_have_no_races():
-    planner = Planner(room(3.0, 3.0), MOTION, cell_m=0.2, headings=12, horizon=5)
+    planner = Planner(room(3.0, 3.0), GEOMETRY, cell_m=0.2, headings=12, horizon=5)
     with pytest.raises(ValueError, match="no lap centre"):
         planner.race(np.array([1.5, 1.5, 0.0]), 5, 1)
 
@@ -141,5 +142,5 @@ def test_random_driving_bumps_after_10_to_16_actions_on_plus():
         robot.close()
     assert 9.0 < driven.runs.mean() < 17.0
     assert driven.retreats_m.mean() > 0.45
-    clear = robot.world.clearance(driven.poses[:, :2]) - MOTION.radius_m
+    clear = robot.world.clearance(driven.poses[:, :2]) - GEOMETRY.radius_m
     assert clear.min() > CONTACT_M

@@ -6,13 +6,14 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from services.robot_driver.atlas.action_geometry import ActionGeometry
 from services.robot_driver.atlas.inspection import problems
-from services.robot_driver.atlas.planner import Motion, Planner
+from services.robot_driver.atlas.planner import Planner
 from services.robot_driver.atlas.survey import corridor_width
 from services.robot_driver.simulated.world import WORLDS, World, load_world
 from shared.config import RobotConfig
 
-MOTION = Motion.of(RobotConfig())
+GEOMETRY = ActionGeometry.of(RobotConfig())
 NAMES = sorted(path.stem for path in WORLDS.glob("*.toml"))
 
 
@@ -23,14 +24,14 @@ def starts(world: World) -> np.ndarray:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_robot_fits_at_every_start_and_along_the_whole_route(name: str):
     world = load_world(name)
-    assert np.all(world.clearance(starts(world)[:, :2]) > MOTION.radius_m + 0.05)
+    assert np.all(world.clearance(starts(world)[:, :2]) > GEOMETRY.radius_m + 0.05)
     if world.route is not None:
-        assert np.all(world.clearance(world.route.sample(0.05)) > MOTION.radius_m)
+        assert np.all(world.clearance(world.route.sample(0.05)) > GEOMETRY.radius_m)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_nothing_is_wrong_with_the_worlds_that_come_along(name: str):
-    assert problems(load_world(name), MOTION) == []
+    assert problems(load_world(name), GEOMETRY) == []
 
 
 def test_minus_is_a_hundred_actions_long_and_looks_nothing_like_plus():
@@ -38,8 +39,8 @@ def test_minus_is_a_hundred_actions_long_and_looks_nothing_like_plus():
     assert len(minus.walls) == 1
     assert minus.lap is None
     x0, _, x1, _ = minus.bounds
-    free = x1 - x0 - 2 * MOTION.radius_m
-    assert 80 <= free / MOTION.step_m <= 120
+    free = x1 - x0 - 2 * GEOMETRY.radius_m
+    assert 80 <= free / GEOMETRY.step_m <= 120
     assert {t.kind for t in minus.textures.values()}.isdisjoint(
         t.kind for t in plus.textures.values()
     )
@@ -48,15 +49,15 @@ def test_minus_is_a_hundred_actions_long_and_looks_nothing_like_plus():
 def test_in_minus_a_robot_turns_back_at_the_end_by_turning_actions_only():
     """Facing a dead end from 1.5 m, a planned run goes on; so the U-turn fits."""
     world = load_world("minus")
-    planner = Planner(world, MOTION, cell_m=0.1, headings=36, horizon=200)
+    planner = Planner(world, GEOMETRY, cell_m=0.1, headings=36, horizon=200)
     run = planner.drive(np.array([[6.3, 0.0, 0.0], [-6.3, 0.0, math.pi]]), 200)
     assert run.survived.tolist() == [200, 200]
 
 
 def test_i16c_is_narrow_everywhere_and_its_one_chevron_door_is_the_only_unique_door():
     world = load_world("i16c")
-    assert corridor_width(world) > 2 * MOTION.radius_m + 0.3
-    circle = 2 * (MOTION.turning_radius_m + MOTION.radius_m)
+    assert corridor_width(world) > 2 * GEOMETRY.radius_m + 0.3
+    circle = 2 * (GEOMETRY.turning_radius_m + GEOMETRY.radius_m)
     # A corridor of 1.2 m: no wall is as far as a U-turn needs, except along corridors.
     assert circle > 1.2
     doors = Counter(f.look for f in world.fixtures if f.kind == "door")
@@ -68,7 +69,7 @@ def test_i16c_is_narrow_everywhere_and_its_one_chevron_door_is_the_only_unique_d
 def test_the_tour_of_i16c_is_long_crosses_two_bridges_and_has_a_junction_near_its_end():
     route = load_world("i16c").route
     assert route is not None
-    assert route.length_m / MOTION.step_m > 300
+    assert route.length_m / GEOMETRY.step_m > 300
     points = route.sample(0.1)
     along = {
         place.name: float(np.argmin(np.hypot(*(points - (place.x_m, place.y_m)).T))) / len(points)
@@ -82,7 +83,7 @@ def test_the_tour_of_i16c_is_long_crosses_two_bridges_and_has_a_junction_near_it
 
 @pytest.fixture(scope="module")
 def i16c() -> Planner:
-    return Planner(load_world("i16c"), MOTION, cell_m=0.1, headings=36, horizon=120)
+    return Planner(load_world("i16c"), GEOMETRY, cell_m=0.1, headings=36, horizon=120)
 
 
 def test_in_i16c_runs_go_on_for_ever_from_starts_but_not_towards_dead_ends(i16c: Planner):
@@ -102,13 +103,13 @@ def test_in_i16c_runs_go_on_for_ever_from_starts_but_not_towards_dead_ends(i16c:
 def test_a_planned_tour_drives_the_whole_route_of_minus_and_tells_how_far_it_is():
     world = load_world("minus")
     assert world.route is not None
-    planner = Planner(world, MOTION, cell_m=0.1, headings=36, horizon=6)
+    planner = Planner(world, GEOMETRY, cell_m=0.1, headings=36, horizon=6)
     run = planner.tour(110)
     driven = planner.progress(run.poses[: int(run.survived[0]) + 1, 0])
     assert driven[0] == 0.0
     assert driven.max() > 0.95 * world.route.length_m
-    assert np.all(np.diff(driven[:90]) <= MOTION.step_m + 1e-9)
-    assert int(driven.argmax()) >= world.route.length_m / MOTION.step_m - 1
+    assert np.all(np.diff(driven[:90]) <= GEOMETRY.step_m + 1e-9)
+    assert int(driven.argmax()) >= world.route.length_m / GEOMETRY.step_m - 1
 
 
 def test_progress_along_a_route_is_the_way_to_the_closest_place_on_it(i16c: Planner):
@@ -117,6 +118,6 @@ def test_progress_along_a_route_is_the_way_to_the_closest_place_on_it(i16c: Plan
 
 
 def test_worlds_without_route_have_no_tours():
-    planner = Planner(load_world("plus"), MOTION, cell_m=0.5, headings=12, horizon=2)
+    planner = Planner(load_world("plus"), GEOMETRY, cell_m=0.5, headings=12, horizon=2)
     with pytest.raises(ValueError, match="no route"):
         planner.tour(5)
