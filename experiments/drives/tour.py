@@ -8,7 +8,7 @@ the robot.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +41,7 @@ ONE_TURN = 5
 """Turns on the spot with no more driven actions between them are told as one event."""
 
 ROLE = "tour"
+BOX_NAME = "dropped-box"
 
 
 @dataclass(frozen=True)
@@ -80,25 +81,118 @@ class Tour:
         return full and len(self.bridges) >= BRIDGES and self.box_dropped and not self.bumps
 
 
-@dataclass
-class _Log:
-    """Poses, bumps and events so far."""
+class _TestDrive:
+    """A tour on its way: poses, bumps and events so far, and what comes next."""
 
-    poses: list[tuple[float, float, float]]
-    bumps: list[bool] = field(default_factory=list)
-    driven: list[bool] = field(default_factory=list)
-    way_m: list[float] = field(default_factory=list)
-    """Of each action; recovery not included."""
-    events: list[Event] = field(default_factory=list)
+    def __init__(
+        self, env: CorridorEnv, network: Predicts, pose: Pose, number: int, policy: PolicyConfig
+    ) -> None:
+        self._env, self._network, self._policy = env, network, policy
+        info = env.reset(seed=number, options={"pose": pose})[1]
+        self._observation: Observation = info["observation"]
+        self._draw = generator(number, ROLE)
+        self._spot_turns = SpotTurns(env.config.robot.turn_rad_s * env.config.robot.period_s)
+        self._poses = [(pose.x_m, pose.y_m, pose.heading_rad)]
+        self._bumps: list[bool] = []
+        self._way_m: list[float] = []
+        """Of each action; recovery not included."""
+        self._events: list[Event] = []
+        self._turned_at = -math.inf
+        self._dropped_at: int | None = None
+        self.driven = self.turned = 0
+        """Actions, turns on the spot apart."""
 
-    def tell(self, text: str) -> None:
-        self.events.append(Event(len(self.events) + 1, len(self.bumps), text))
+    def act(self) -> None:
+        """Drive or turn as the network says."""
+        values = self._network.all_values(image_array(self._observation.image)[None])[0]
+        action, _ = choose(values, self._policy, self._draw)
+        if side := self._spot_turns.decide(values, action):
+            if self.driven > self._turned_at + ONE_TURN:
+                self._tell(f"turns {side} on the spot")
+            self._turned_at = self.driven
+            self._observation = self._env.turn(side == "left")
+            self.turned += 1
+            self._note(bump=False, way_m=0.0)
+        else:
+            self._drive(action)
+            self.driven += 1
 
-    def add(self, pose: Pose, *, bump: bool, driven: bool, way_m: float = 0.0) -> None:
-        self.poses.append((pose.x_m, pose.y_m, pose.heading_rad))
-        self.bumps.append(bump)
-        self.driven.append(driven)
-        self.way_m.append(way_m)
+    def _drive(self, action: int) -> None:
+        before = self._env.robot.pose
+        _, _, bumped, _, info = self._env.step(np.int64(action))
+        here = self._env.robot.pose
+        way_m = math.hypot(here.x_m - before.x_m, here.y_m - before.y_m)
+        if bumped:
+            _, info = self._env.reset()
+            self._tell("bumps")
+        self._observation = info["observation"]
+        self._note(bump=bumped, way_m=way_m)
+
+    def full(self) -> bool:
+        """Whether it was long enough: actions, box, route and bridges."""
+        if self._dropped_at is None or self.driven < max(DRIVEN, self._dropped_at + BEYOND_BOX):
+            return False
+        world, places_m = self._env.robot.world, np.array(self._poses)[:, :2]
+        bridges = _bridges(world, places_m)
+        return len(bridges) >= BRIDGES and route_share(world, places_m) >= ROUTE_SHARE
+
+    def drop_box_if_due(self) -> None:
+        """Drop the box across the robot's way, at a junction towards the end, if there is room."""
+        pose = self._env.robot.pose
+        due = self._dropped_at is None and self.driven >= DROP_AFTER
+        if not due or not _at_junction(self._env.robot.world, pose):
+            return
+        wish = WorldChange(kind="place", box=_box_ahead(pose))
+        if self._env.driver.change(wish, at_once=True).accepted:
+            self._tell("a box drops in front of the robot")
+            self._dropped_at = self.driven
+        self._observation = self._env.observe()
+
+    def tell_passed(self) -> None:
+        """Note named places the first time the robot comes past them."""
+        route = self._env.robot.world.route
+        assert route is not None
+        x, y, _ = self._poses[-1]
+        told = {event.text for event in self._events}
+        for place in route.places:
+            text = f"at {place.name}"
+            if text not in told and math.hypot(place.x_m - x, place.y_m - y) <= NEAR_M / 2:
+                self._tell(text)
+
+    def end(self) -> Tour:
+        """Take the box away again and tell what happened."""
+        dropped = self._dropped_at is not None
+        if dropped:
+            self._env.robot.remove(BOX_NAME)
+        world, poses = self._env.robot.world, np.array(self._poses)
+        laps = self._env.robot.laps
+        trace = Trace(
+            world=world.name,
+            bumps=np.array(self._bumps, np.bool_),
+            places_m=poses[:, :2],
+            headings_rad=poses[:, 2],
+            way_m=np.array(self._way_m),
+            laps_left=laps.left,
+            laps_right=laps.right,
+        )
+        return Tour(
+            Route(trace, tuple(self._events)),
+            self.driven,
+            self.turned,
+            route_share(world, poses[:, :2]),
+            _bridges(world, poses[:, :2]),
+            dropped,
+        )
+
+    def _tell(self, text: str) -> None:
+        self._events.append(Event(len(self._events) + 1, len(self._bumps), text))
+
+    def _note(self, *, bump: bool, way_m: float) -> None:
+        """An action or a turn is over."""
+        pose = self._env.robot.pose
+        self._poses.append((pose.x_m, pose.y_m, pose.heading_rad))
+        self._bumps.append(bump)
+        self._way_m.append(way_m)
 
 
 def drive_tour(
@@ -126,43 +220,14 @@ def drive_tour(
     world = env.robot.world
     if world.route is None:
         raise ValueError(f"world {world.name!r} has no route")
-    observation: Observation = env.reset(seed=number, options={"pose": pose})[1]["observation"]
-    log = _Log([(pose.x_m, pose.y_m, pose.heading_rad)])
-    dropped, dropped_at = False, 0
-    draw = generator(number, ROLE)
-    spot_turns = SpotTurns(env.config.robot.turn_rad_s * env.config.robot.period_s)
-    turned_at = -math.inf
-    while (driven := sum(log.driven)) < most_driven and len(log.bumps) < 4 * most_driven:
-        _tell_passed(world, log)
-        if dropped and driven >= max(DRIVEN, dropped_at + BEYOND_BOX) and _full(world, log):
+    drive = _TestDrive(env, network, pose, number, policy)
+    while drive.driven < most_driven and drive.driven + drive.turned < 4 * most_driven:
+        drive.tell_passed()
+        if drive.full():
             break
-        if not dropped and driven >= DROP_AFTER and _at_junction(world, env.robot.pose):
-            dropped, dropped_at = _drop_box(env, log), driven
-            observation = env.observe()
-        values = network.all_values(image_array(observation.image)[None])[0]
-        action, _ = choose(values, policy, draw)
-        if side := spot_turns.decide(values, action):
-            if driven > turned_at + ONE_TURN:
-                log.tell(f"turns {side} on the spot")
-            turned_at = driven
-            observation = env.turn(side == "left")
-            log.add(env.robot.pose, bump=False, driven=False)
-            continue
-        before = env.robot.pose
-        _, _, bumped, _, info = env.step(np.int64(action))
-        here = env.robot.pose
-        way_m = math.hypot(here.x_m - before.x_m, here.y_m - before.y_m)
-        if bumped:
-            _, info = env.reset()
-            log.tell("bumps")
-        observation = info["observation"]
-        log.add(env.robot.pose, bump=bumped, driven=True, way_m=way_m)
-    if dropped:
-        env.robot.remove(BOX_NAME)
-    return _tour(env, log, dropped)
-
-
-BOX_NAME = "dropped-box"
+        drive.drop_box_if_due()
+        drive.act()
+    return drive.end()
 
 
 def route_share(world: World, places_m: npt.NDArray[np.float64], near_m: float = NEAR_M) -> float:
@@ -171,12 +236,6 @@ def route_share(world: World, places_m: npt.NDArray[np.float64], near_m: float =
     line = world.route.sample(0.1)
     gaps = np.hypot(*(line[:, None] - places_m[None]).transpose(2, 0, 1)).min(axis=1)
     return float(np.mean(gaps <= near_m))
-
-
-def _full(world: World, log: _Log) -> bool:
-    """Whether the robot has come along enough of the route and over enough bridges."""
-    places_m = np.array(log.poses)[:, :2]
-    return len(_bridges(world, places_m)) >= BRIDGES and route_share(world, places_m) >= ROUTE_SHARE
 
 
 def _bridges(world: World, places_m: npt.NDArray[np.float64]) -> tuple[str, ...]:
@@ -188,42 +247,8 @@ def _bridges(world: World, places_m: npt.NDArray[np.float64]) -> tuple[str, ...]
     )
 
 
-def _tour(env: CorridorEnv, log: _Log, dropped: bool) -> Tour:
-    world, poses = env.robot.world, np.array(log.poses)
-    laps = env.robot.laps
-    trace = Trace(
-        world=world.name,
-        bumps=np.array(log.bumps, np.bool_),
-        places_m=poses[:, :2],
-        headings_rad=poses[:, 2],
-        way_m=np.array(log.way_m),
-        laps_left=laps.left,
-        laps_right=laps.right,
-    )
-    driven = sum(log.driven)
-    return Tour(
-        Route(trace, tuple(log.events)),
-        driven,
-        len(log.driven) - driven,
-        route_share(world, poses[:, :2]),
-        _bridges(world, poses[:, :2]),
-        dropped,
-    )
-
-
 def _nearest_m(places_m: npt.NDArray[np.float64], x_m: float, y_m: float) -> float:
     return float(np.hypot(places_m[:, 0] - x_m, places_m[:, 1] - y_m).min())
-
-
-def _tell_passed(world: World, log: _Log) -> None:
-    """Note named places the first time the robot comes past them."""
-    assert world.route is not None
-    x, y, _ = log.poses[-1]
-    told = {event.text for event in log.events}
-    for place in world.route.places:
-        text = f"at {place.name}"
-        if text not in told and math.hypot(place.x_m - x, place.y_m - y) <= NEAR_M / 2:
-            log.tell(text)
 
 
 def _at_junction(world: World, pose: Pose) -> bool:
@@ -235,10 +260,8 @@ def _at_junction(world: World, pose: Pose) -> bool:
     )
 
 
-def _drop_box(env: CorridorEnv, log: _Log) -> bool:
-    """Drop the box across the robot's way; False where a wall leaves no place for it."""
-    pose = env.robot.pose
-    box = Box(
+def _box_ahead(pose: Pose) -> Box:
+    return Box(
         name=BOX_NAME,
         x_m=pose.x_m + BOX_AHEAD_M * math.cos(pose.heading_rad),
         y_m=pose.y_m + BOX_AHEAD_M * math.sin(pose.heading_rad),
@@ -248,7 +271,3 @@ def _drop_box(env: CorridorEnv, log: _Log) -> bool:
         height_m=0.9,
         rgb=(190, 60, 40),
     )
-    done = env.driver.change(WorldChange(kind="place", box=box), at_once=True)
-    if done.accepted:
-        log.tell("a box drops in front of the robot")
-    return done.accepted

@@ -11,9 +11,10 @@ import os
 import queue
 import signal
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
+from multiprocessing.context import SpawnContext
 from pathlib import Path
 from typing import Any
 
@@ -79,26 +80,18 @@ def run_experiment(
         ConfigError: No plan of that name, or one that cannot be run.
         CorridorError: A run failed; the others were stopped after their current turn.
     """
-    chains = [chain(name, scale) for name in names]
-    wanted = [
-        [Job(plan.name, scale, seed, out) for plan in plans]
-        for plans in chains
-        for seed in (plans[-1].seeds[:seeds] if isinstance(seeds, int) else seeds)
-    ]
+    pieces = _pieces(names, scale, seeds, out)
     context = multiprocessing.get_context("spawn")
     reports: Any = context.Queue()
     stop: Any = context.Event()
-    shares: Any = context.Queue()
-    for share in shares_of(sorted(os.sched_getaffinity(0)), jobs):
-        shares.put(share)
+    shares = _queue_of(context, shares_of(sorted(os.sched_getaffinity(0)), jobs))
     for number in STOPS:  # also where the shell had SIGINT ignored, as it does in the background
         signal.signal(number, signal.default_int_handler)
     with (
         ProcessPoolExecutor(jobs, context, _begin, (reports, stop, shares)) as pool,
         _bars(console) as bars,
     ):
-        # A chain of one seed is one piece of work; equal jobs of two chains are done only once.
-        futures = [pool.submit(_work, jobs_of_seed) for jobs_of_seed in _distinct(wanted)]
+        futures = [pool.submit(_work, piece) for piece in pieces]
         try:
             _watch(futures, reports, bars)
         except KeyboardInterrupt:
@@ -110,6 +103,27 @@ def run_experiment(
 def shares_of(cores: Sequence[int], jobs: int) -> list[set[int]]:
     """Cores of each of the runs side by side: different ones as far as there are enough."""
     return [set(cores[job % len(cores) :: jobs]) for job in range(jobs)]
+
+
+def _queue_of(context: SpawnContext, items: Iterable[object]) -> Any:
+    """A queue to other processes that holds these items."""
+    made: Any = context.Queue()
+    for item in items:
+        made.put(item)
+    return made
+
+
+def _pieces(
+    names: Sequence[str], scale: Scale, seeds: Sequence[int] | int, out: Path
+) -> list[list[Job]]:
+    """The jobs of an experiment as pieces of work. Raises ConfigError."""
+    chains = [chain(name, scale) for name in names]
+    wanted = [
+        [Job(plan.name, scale, seed, out) for plan in plans]
+        for plans in chains
+        for seed in (plans[-1].seeds[:seeds] if isinstance(seeds, int) else seeds)
+    ]
+    return _distinct(wanted)
 
 
 def _distinct(chains: list[list[Job]]) -> list[list[Job]]:
