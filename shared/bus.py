@@ -65,7 +65,7 @@ class Request:
     """One request waiting for its answer. Use as a context manager: leaving finishes it."""
 
     message: Message
-    """What is asked, once it is read."""
+    """The question, as soon as `read` has returned."""
 
     def __init__(self, stream: Stream, query: zenoh.Query) -> None:
         self.stream, self._query = stream, query

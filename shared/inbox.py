@@ -1,4 +1,4 @@
-"""Where messages for one thread wait, in bounded places, until it takes them.
+"""Keeps messages for one thread, in bounded places, until it takes them.
 
 The bus's threads only put bytes in. The one thread that owns the inbox decodes and acts.
 Undecodable, oversized and overflowing messages are counted by stream.
@@ -27,7 +27,7 @@ MAX_SENDERS = 64
 
 
 class Inbox:
-    """Where messages for one thread arrive. All methods but `wake` belong to that thread."""
+    """Messages that came for one thread. All methods but `wake` belong to that thread."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus

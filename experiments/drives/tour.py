@@ -29,7 +29,7 @@ from shared.rl.spot_turns import SpotTurns
 DRIVEN, MOST_DRIVEN = 300, 1200
 """Actions of a full tour at least, turns on the spot not counted, and of one that is given up."""
 ROUTE_SHARE, BRIDGES = 0.6, 2
-"""Of the route's length, and how many bridges, a full tour comes along."""
+"""Share of the route's length, and number of bridges, that a full tour passes."""
 DROP_AFTER = 200
 """Driven actions after which the next junction counts as the last one."""
 BEYOND_BOX = 30
@@ -95,12 +95,12 @@ class _TestDrive:
         self._poses = [(pose.x_m, pose.y_m, pose.heading_rad)]
         self._bumps: list[bool] = []
         self._way_m: list[float] = []
-        """Of each action; recovery not included."""
+        """Metres driven by each action, without recoveries."""
         self._events: list[Event] = []
         self._turned_at = -math.inf
         self._dropped_at: int | None = None
         self.driven = self.turned = 0
-        """Actions, turns on the spot apart."""
+        """Actions so far, and turns on the spot so far."""
 
     def act(self) -> None:
         """Drive or turn as the network says."""
@@ -129,7 +129,7 @@ class _TestDrive:
         self._note(bump=bumped, way_m=way_m)
 
     def full(self) -> bool:
-        """Whether it was long enough: actions, box, route and bridges."""
+        """Whether the tour is full, in actions, route and bridges, and is past the box."""
         if self._dropped_at is None or self.driven < max(DRIVEN, self._dropped_at + BEYOND_BOX):
             return False
         world, places_m = self._env.robot.world, np.array(self._poses)[:, :2]

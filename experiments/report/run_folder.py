@@ -29,7 +29,7 @@ Floats = npt.NDArray[np.float64]
 LEAST_WINDOW = 10
 """Episodes that a point of a curve averages at the smallest scale."""
 WINDOW = 100
-"""The same at full scale (A37)."""
+"""Episodes that a point of a curve averages at full scale (A37)."""
 
 
 @dataclass(frozen=True)
@@ -91,9 +91,9 @@ class RunFolder:
     evaluations: Rows
     probes: tuple[Probes, ...]
     routes: dict[str, Route]
-    """By label."""
+    """The route of each drive, by its label."""
     tours: tuple[TourRecord, ...]
-    """In the order of the starts; empty where the plan has none."""
+    """The test drives in the order of their starts. It is empty where the plan has none."""
 
     @property
     def window(self) -> int:

@@ -20,12 +20,12 @@ EVALUATIONS = "evaluations.csv"
 
 
 class Evaluations:
-    """Looks at the network as often and as thoroughly as a plan says.
+    """Drives with the network as thoroughly as a plan says, and records it.
 
     Args:
-        plan: Of the run.
-        folder: Of the run.
-        config: Of its first stage.
+        plan: Plan of the run.
+        folder: Folder of the run.
+        config: Configuration of its first stage.
     """
 
     def __init__(self, plan: Plan, folder: Path, config: Config) -> None:
@@ -41,7 +41,7 @@ class Evaluations:
 
         Args:
             world: Where the run drives.
-            now: How far the run is: the columns that say so.
+            now: Columns that say how far the run is.
             over: Whether the stage is over.
         """
         settings = self._plan.evaluation
@@ -55,7 +55,7 @@ class Evaluations:
         append_csv(self._folder / EVALUATIONS, EVALUATION_COLUMNS, rows)
 
     def drive_tours(self, world: str) -> None:
-        """Test drives with turns on the spot (A45): their routes, and `tours.json` about all."""
+        """Carry out the test drives (A45); write their routes, and `tours.json` about all."""
         told = []
         tours = self._observer.tours(world, self._plan.tours, self._plan.tour_policy)
         for number, tour in enumerate(tours):
@@ -64,7 +64,7 @@ class Evaluations:
         write_atomically(self._folder / "tours.json", (json.dumps(told, indent=2) + "\n").encode())
 
     def drive_references(self, now: Row) -> None:
-        """Record floor and ceiling of all worlds that were driven in, at the end of the record."""
+        """Record random actions and the planner in all worlds that were driven in."""
         settings, kept = self._plan.evaluation, self._folder.parents[1] / "references"
         path, rows = self._folder / EVALUATIONS, []
         for world in sorted({row["world"] for row in read_csv(path, EVALUATION_COLUMNS)}):
@@ -80,7 +80,7 @@ class Evaluations:
         return self._observer.drives_lap(world)
 
     def take_pictures(self, label: str, world: str) -> None:
-        """What the network predicts, where the run drives and in all worlds of the evaluation."""
+        """Save what the network predicts in `world` and in all worlds of the evaluation."""
         for each in sorted({world, *self._plan.evaluation.worlds}):
             probes.save(self._folder / f"probes-{label}-{each}.npz", self._observer.look(each))
 

@@ -57,17 +57,17 @@ class Progress:
     episodes: int
     actions: int
     fitness: float
-    """Mean of the last episodes."""
+    """Mean over the last episodes."""
 
 
 class Run:
     """A plan with a seed in a folder.
 
     Args:
-        plan: At the scale wanted.
-        scale: Its name, for the record.
-        seed: Of everything.
-        folder: Of this run; made, or continued.
+        plan: The plan at the wanted scale.
+        scale: Name of the scale, for the record.
+        seed: Seed of every draw.
+        folder: Folder of this run, to be made or continued.
         predecessor: Folder of the finished run this one goes on from, if the plan has one.
         command: What to run to repeat it.
 
@@ -105,7 +105,7 @@ class Run:
 
     @property
     def _stage_name(self) -> str:
-        """Of the stage that goes on, or was the last; empty of a plan without any."""
+        """Name of the stage that runs, or ran last. It is empty for a plan without stages."""
         index = min(self._stage, len(self.plan.stages) - 1)
         return self.plan.stages[index].name if self.plan.stages else ""
 
@@ -231,7 +231,7 @@ class Run:
 
     @property
     def _all_actions(self) -> int:
-        """Those of the fill included."""
+        """Actions so far, those included that filled the memory."""
         return self._loop.actor.actions
 
     def _show(self) -> None:
@@ -331,7 +331,7 @@ class Run:
             self._loop.reconfigure(self._config(self._stage))
 
     def _drop_unsaved(self) -> None:
-        """Rows written after the snapshot come again."""
+        """Delete rows that were written after the snapshot: they will be written again."""
         newest = self._loop.counters.episode if self._totals.stages else 0
         for name, columns in ((EPISODES, EPISODE_COLUMNS), (EVALUATIONS, EVALUATION_COLUMNS)):
             path = self.folder / name

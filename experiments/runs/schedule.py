@@ -43,12 +43,12 @@ class Job:
 
     @property
     def folder(self) -> Path:
-        """Where it lies."""
+        """Folder of the run."""
         return self.out / f"{self.plan}-{self.scale}" / f"seed-{self.seed}"
 
     @property
     def name(self) -> str:
-        """Of its bar."""
+        """Name of its progress bar."""
         return f"{self.plan} {self.seed}"
 
 
@@ -69,9 +69,9 @@ def run_experiment(
     """Run plans with some seeds, predecessors included; whether all came to their end.
 
     Args:
-        names: Of plans.
+        names: Names of plans.
         scale: `full` or `mini`.
-        seeds: These, or how many of each plan's own, from the first.
+        seeds: The seeds, or how many of each plan's own seeds, from the first on.
         out: Folder for all runs.
         jobs: Runs side by side; they divide the cores among them.
         console: Where progress is shown.

@@ -111,5 +111,5 @@ def _memory(path: Path, capacity: int) -> ReplayMemory:
 
 
 def _identity(loop: SingleProcess) -> str:
-    """Of the seed alone: the name changes along a chain of experiments."""
+    """Identity of a chain of experiments: its seed alone, because the name changes in it."""
     return f"experiment/{loop.config.run.seed}"

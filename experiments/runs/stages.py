@@ -17,10 +17,10 @@ def enter(
     """Let the loop go on in a stage.
 
     Args:
-        loop: Between two turns.
-        plan: Of the run.
+        loop: The loop, between two turns.
+        plan: Plan of the run.
         stage: The stage.
-        config: Of the stage.
+        config: Configuration of the stage.
         offset: Episodes before this run.
         first: Whether the run begins with this stage.
 

@@ -1,4 +1,4 @@
-"""What a run counts beside its loop: time, stages, laps, and actions without a bump."""
+"""Counts of a run beside those of its loop: time, stages, first lap, actions without a bump."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from services.replay.numbering import bump_free
 
 @dataclass
 class Totals:
-    """Saved with each snapshot."""
+    """The counts of a run. They are saved with each snapshot."""
 
     seconds: float = 0.0
     """Wall time of driving and learning, evaluations not counted."""

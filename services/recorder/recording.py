@@ -41,11 +41,11 @@ RECORDED: tuple[Stream, ...] = tuple(s for s in STREAMS if s.delivery == "latest
 
 @dataclass(frozen=True)
 class Origin:
-    """Of which run a recording is, and all that decides what its actor chooses."""
+    """The run that a recording is of, and all that decides what its actor chooses."""
 
     config: Config
     numerics: ActorNumerics
-    """Of the actor, settled."""
+    """Settled numerics of the actor."""
     protocol: int = PROTOCOL_VERSION
     preprocessing: int = PREPROCESS_VERSION
 

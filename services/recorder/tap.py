@@ -1,4 +1,4 @@
-"""Every message of `latest` streams, in the order of arrival, for one thread that keeps up."""
+"""Hears every message of `latest` streams, in the order of arrival, for one thread."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class Heard:
 
     stream: Stream
     ident: str
-    """Of the sender, from the key."""
+    """Sender, as its key says."""
     time_ns: int
     """When it arrived, by the clock of this computer since 1970."""
     data: bytes
 
 
 class Tap:
-    """Hears these streams of a run from now on.
+    """Messages of these streams of a run from now on, for a thread that keeps up.
 
     At most `MAX_MESSAGES` of them and `MAX_BYTES` wait; what comes beyond that is lost and counted.
     """

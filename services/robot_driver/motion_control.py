@@ -41,7 +41,7 @@ class MotionControl:
         self._config, self._robot, self._safety, self._host = config, robot, safety, host
         self._moving = False
         self.motion: Motion = ""
-        """The motion in force, or just over; empty: an action."""
+        """The motion in force, or the one just over. It is empty for an action."""
 
     def start_action(self, action: int) -> None:
         """Begin to drive an action."""

@@ -227,7 +227,7 @@ class Reach:
 
     @classmethod
     def of(cls, world: World, radius_m: float) -> Reach:
-        """By flood fill over a grid of `CELL_M`."""
+        """Find the parts by flood fill over a grid of `CELL_M`."""
         x0, y0, x1, y1 = world.bounds
         rows, columns = math.ceil((y1 - y0) / CELL_M) + 1, math.ceil((x1 - x0) / CELL_M) + 1
         y, x = np.mgrid[0:rows, 0:columns] * CELL_M

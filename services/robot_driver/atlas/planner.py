@@ -30,7 +30,7 @@ _ARRIVAL_M = 1.0
 _CORNER_M = 2.5
 """Corners of a route may be cut; who gets farther ahead at once has left out a part of it."""
 _ARRIVAL_GAIN = 100.0
-"""Of each action there: worth more than turning back before a dead end."""
+"""Gain of each action there: more than turning back before a dead end is worth."""
 _LOST = -100.0
 """Value of a run that cannot go on."""
 
@@ -68,7 +68,7 @@ class Planner:
 
     Args:
         world: The map.
-        geometry: Of the three actions.
+        geometry: Geometry of the three actions.
         cell_m: Grid distance of positions.
         headings: Number of grid headings.
         horizon: Actions a saved run lasts.
@@ -259,7 +259,7 @@ class _Track:
 
     @property
     def length_m(self) -> float:
-        """Of all legs."""
+        """Length of all legs."""
         return float(np.hypot(*np.diff(self.points, axis=0).T).sum())
 
     def along(self, poses: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""A grid of positions and headings, and tables over it, read between grid poses."""
+"""Reads tables over a grid of positions and headings, also between grid poses."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class PoseGrid:
     """Poses in a rectangle.
 
     Args:
-        bounds: Of the rectangle: x and y of the lower corner, x and y of the upper, metres.
-        geometry: Of the actions.
+        bounds: x and y of the lower corner, x and y of the upper corner, metres.
+        geometry: Geometry of the actions.
         cell_m: Grid distance of positions.
         headings: Number of grid headings.
     """
@@ -45,7 +45,7 @@ class PoseGrid:
 
     @property
     def heading_step(self) -> float:
-        """Between two grid headings, radians."""
+        """Angle between two grid headings, radians."""
         return 2.0 * math.pi / self.headings
 
     def least_on_way(self, plane: Table, action: int) -> Table:

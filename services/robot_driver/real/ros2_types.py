@@ -30,7 +30,7 @@ FULL_NAMES = {
     "BatteryState": "sensor_msgs/msg/BatteryState",
     "PowerReadings": "rto_msgs/msg/PowerReadings",
 }
-"""By short name, the types a robot is driven with."""
+"""Full names of the types that a robot is driven with, by short name."""
 
 KIB = 1024
 MAX_BYTES = {

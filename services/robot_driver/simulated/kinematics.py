@@ -1,4 +1,4 @@
-"""Where a body velocity leads on a floor without walls."""
+"""Computes where a body velocity leads on a floor without walls."""
 
 from __future__ import annotations
 

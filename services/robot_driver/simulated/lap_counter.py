@@ -16,7 +16,7 @@ class LapCounter:
     winding_rad: float = 0.0
     """Net angle so far, in this world."""
     lap_start_rad: float = 0.0
-    """The same where the newest lap was counted."""
+    """Net angle at which the newest lap was counted."""
     left: int = 0
     right: int = 0
 

@@ -49,7 +49,7 @@ GAP_M = 0.0002
 """The shell never comes nearer to a wall than this."""
 _OBSTACLES = TypeAdapter(tuple[Obstacle, ...])
 _HALVINGS = 6
-"""Of a substep that would touch: what is left of 1 cm is well inside the skin."""
+"""How often a substep that would touch is halved: what is left is well inside the skin."""
 
 
 class SimRobot(Robot):
