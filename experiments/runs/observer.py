@@ -2,30 +2,42 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
+from experiments.drives import routes
 from experiments.drives.choosers import greedy
 from experiments.drives.frozen_drives import drive_from_first_start, evaluate
-from experiments.drives.references import reference
-from experiments.drives.tour import Tour, drive_tour
+from experiments.drives.references import DRIVERS, reference
+from experiments.drives.tour import drive_tour
 from experiments.drives.traces import Figures, first_lap
 from experiments.environment import CorridorEnv, with_world
+from experiments.plans.plan import Plan
+from experiments.records import EVALUATION_COLUMNS
 from experiments.runs import probes
-from experiments.runs.probes import Probes
 from services.robot_driver.robot import Pose
-from shared.config import Config, PolicyConfig
+from shared.config import Config
 from shared.rl.predictor import Predictor
+from shared.run_record import Row, append_csv, read_csv
+from shared.statefile import write_atomically
 
+EVALUATIONS = "evaluations.csv"
 LAP_ACTIONS = 400
 """A frozen drive that has not gone round by then does not count as one that drives laps."""
 
 
 class Observer:
-    """One network, frozen, in any world: as its file says, whatever a run has changed there."""
+    """Drives with one network, frozen, in any world as its file says, and records it.
 
-    def __init__(self, config: Config) -> None:
-        self._config = config
+    Args:
+        plan: Plan of the run.
+        folder: Folder of the run.
+        config: Configuration of its first stage.
+    """
+
+    def __init__(self, plan: Plan, folder: Path, config: Config) -> None:
+        self._plan, self._folder, self._config = plan, folder, config
         self._network = Predictor(config.network, config.numerics.actor)
         self._envs: dict[str, CorridorEnv] = {}
         self._shown = b""
@@ -36,9 +48,23 @@ class Observer:
             self._network.load(0, weights)
             self._shown = weights
 
-    def evaluate(self, world: str, starts: int, actions: int) -> Figures:
-        """Figures of greedy drives."""
-        return evaluate(self._env(world), greedy(self._network), starts, actions).figures
+    def evaluate(self, world: str, now: Row, *, over: bool) -> None:
+        """Drive greedily: thoroughly at the end of a stage, briefly and in `world` on the way.
+
+        Args:
+            world: Where the run drives.
+            now: Columns that say how far the run is.
+            over: Whether the stage is over.
+        """
+        settings = self._plan.evaluation
+        label = f"stage {now['stage']}" if over else "every"
+        starts = settings.starts if over else settings.every_starts
+        actions = settings.actions if over else settings.every_length
+        rows = []
+        for each in (settings.worlds if over else ()) or (world,):
+            done = evaluate(self._env(each), greedy(self._network), starts, actions)
+            rows.append(_row(label, "network", each, done.figures, now))
+        append_csv(self._folder / EVALUATIONS, EVALUATION_COLUMNS, rows)
 
     def drives_lap(self, world: str) -> bool:
         """Whether it drives round the lap centre without a bump, from the world's first start.
@@ -50,22 +76,37 @@ class Observer:
         trace = drive_from_first_start(env, greedy(self._network), LAP_ACTIONS)
         return first_lap(trace, env.robot.world) is not None
 
-    def look(self, world: str) -> Probes:
-        """Pictures of a world, and what is predicted for them."""
-        return probes.look(self._env(world).robot, self._network)
+    def take_pictures(self, label: str, world: str) -> None:
+        """Save what the network predicts in `world` and in all worlds of the evaluation."""
+        for each in sorted({world, *self._plan.evaluation.worlds}):
+            seen = probes.look(self._env(each).robot, self._network)
+            probes.save(self._folder / f"probes-{label}-{each}.npz", seen)
 
-    def tours(self, world: str, count: int, policy: PolicyConfig) -> list[Tour]:
-        """Test drives from the world's first start poses. Raises ValueError without a route."""
-        env = self._env(world)
-        poses = [
-            Pose(start.x_m, start.y_m, math.radians(start.heading_deg))
-            for start in env.robot.world.starts[:count]
-        ]
-        return [drive_tour(env, self._network, pose, n, policy) for n, pose in enumerate(poses)]
+    def drive_tours(self, world: str) -> None:
+        """Carry out the test drives (A45); write their routes, and `tours.json` about all.
 
-    def reference(self, world: str, driver: str, starts: int, actions: int, kept: Path) -> Figures:
-        """Figures of the floor or the ceiling (`references.reference`)."""
-        return reference(self._env(world), driver, starts, actions, kept)
+        Raises:
+            ValueError: The world has no route.
+        """
+        env, told = self._env(world), []
+        for number, start in enumerate(env.robot.world.starts[: self._plan.tours]):
+            pose = Pose(start.x_m, start.y_m, math.radians(start.heading_deg))
+            tour = drive_tour(env, self._network, pose, number, self._plan.tour_policy)
+            routes.write(self._folder / f"route-tour-{number}.npz", tour.route)
+            told.append(tour.told.model_dump(mode="json"))
+        write_atomically(self._folder / "tours.json", (json.dumps(told, indent=2) + "\n").encode())
+
+    def drive_references(self, now: Row) -> None:
+        """Record random actions and the planner in all worlds that were driven in."""
+        settings, kept = self._plan.evaluation, self._folder.parents[1] / "references"
+        path, rows = self._folder / EVALUATIONS, []
+        for world in sorted({row["world"] for row in read_csv(path, EVALUATION_COLUMNS)}):
+            for driver in DRIVERS:
+                figures = reference(
+                    self._env(world), driver, settings.starts, settings.actions, kept
+                )
+                rows.append(_row("reference", driver, world, figures, now))
+        append_csv(path, EVALUATION_COLUMNS, rows)
 
     def close(self) -> None:
         """Free the simulations."""
@@ -76,3 +117,9 @@ class Observer:
         if world not in self._envs:
             self._envs[world] = CorridorEnv(config=with_world(self._config, world))
         return self._envs[world]
+
+
+def _row(label: str, driver: str, world: str, figures: Figures, now: Row) -> Row:
+    """A row of `evaluations.csv`."""
+    drive = {key: round(float(value), 5) for key, value in figures.items()}
+    return {"label": label, "driver": driver, "world": world, **drive, **now}

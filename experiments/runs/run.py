@@ -19,7 +19,7 @@ from experiments.plans.plan import Plan, Scale, stage_config
 from experiments.records import EVALUATION_COLUMNS
 from experiments.runs import snapshot, stages
 from experiments.runs.episode_row import episode_row, held, memory_hash
-from experiments.runs.evaluations import EVALUATIONS, Evaluations
+from experiments.runs.observer import EVALUATIONS, Observer
 from experiments.runs.totals import Totals
 from experiments.single_process import SingleProcess, TurnDone
 from services.robot_driver.simulated.sim import SimRobot
@@ -99,7 +99,7 @@ class Run:
         self._stage = 0
         self._offset = 0
         self._driving = self._best = b""
-        self._evaluations = Evaluations(plan, folder, config)
+        self._observer = Observer(plan, folder, config)
         self._fitness: list[int] = []
         self._restore(predecessor)
 
@@ -142,7 +142,7 @@ class Run:
     def close(self) -> None:
         """Free the simulations."""
         self._loop.env.close()
-        self._evaluations.close()
+        self._observer.close()
 
     # ------------------------------------------------------------ stages
 
@@ -177,12 +177,12 @@ class Run:
         if self._totals.evaluated_at < 0 or due or over:
             self._totals.evaluated_at = counters.actions
             self._show()
-            self._evaluations.drive(self._world, self._now(), over=over)
+            self._observer.evaluate(self._world, self._now(), over=over)
         if not over:
             return False
         self._totals.end_stage(self._loop)
         self._show()
-        self._evaluations.take_pictures(stage.name, self._world)
+        self._observer.take_pictures(stage.name, self._world)
         self._stage += 1
         if self._stage == len(self.plan.stages):
             return True
@@ -195,10 +195,10 @@ class Run:
         write_atomically(self.folder / "best.safetensors", self._best)
         if self.plan.tours:
             self._show()
-            self._evaluations.drive_tours(self._world)
-        self._evaluations.show(self._best)  # of the longest bump-free run (Fig 4.7)
-        self._evaluations.take_pictures("best", self._world)
-        self._evaluations.drive_references(self._now())
+            self._observer.drive_tours(self._world)
+        self._observer.show(self._best)  # of the longest bump-free run (Fig 4.7)
+        self._observer.take_pictures("best", self._world)
+        self._observer.drive_references(self._now())
         self._write_run(complete=True)
         snapshot.replace(self.folder, snapshot.END, self._loop, self._extra())
 
@@ -212,7 +212,7 @@ class Run:
             return
         self._totals.lap_checked_at = actions // every
         self._show()
-        if self._evaluations.drives_lap(world.name):
+        if self._observer.drives_lap(world.name):
             self._totals.note_lap(self._loop)
 
     @property
@@ -235,8 +235,8 @@ class Run:
         return self._loop.actor.actions
 
     def _show(self) -> None:
-        """Let the target network, as it is now, be looked at."""
-        self._evaluations.show(to_bytes(self._loop.trainer.target_network))
+        """Let the observer look at the target network as it is now."""
+        self._observer.show(to_bytes(self._loop.trainer.target_network))
 
     # ------------------------------------------------------------ records
 
