@@ -1,12 +1,10 @@
-"""The reference loop, experiments in it, and what is told about them.
+"""The reference loop, experiments in it, and reports about them.
 
-Read `single_process` first. Then, each group resting on those before:
+Read `single_process` first. Then, each folder resting on those before:
 
-learning    environment, single_process
-driving     places, choosers, traces, evaluation, routes, references, tour, evaluate
-running     plan (data in plans/), recorder, probes, observer, snapshot, runner,
-            experiment, commands
-telling     records, runs, measures, statistics, comparisons, findings, tables, figures/, document,
-            costs, report, results
-beside it   baseline_dqn, sb3
+plans       experiments as data
+drives      drives of frozen networks, of the planner and of random actions
+runs        runs of plans with seeds, stopped and continued
+report      figures, tables and findings of runs
+baseline    DQN on the same environment
 """
