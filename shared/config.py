@@ -250,7 +250,7 @@ class NetworkConfig(Section):
     filters: int = Field(default=64, ge=4, le=256)
     """Filters of each convolution. RMM needs a divisor or a multiple of 16 (A29)."""
     layout: Literal["ccpccp", "cpcccp"] = "ccpccp"
-    """Order of the four convolutions and two pools. Both orders end in 9x15 maps (E16)."""
+    """Order of convolutions (c) and pools (p). Both orders end in 9x15 maps (E16)."""
 
 
 class MemoryConfig(Section):
