@@ -115,12 +115,12 @@ class Session:
             self._begin(self._observation)
         while self._pending is not None:
             if not self._handed_over(self._pending):
+                self._hold(self._observation)
                 return None
             self._finish(self._observation)  # it may have come meanwhile
         if self._may_act():
             return self._observation
-        if self._me.config.robot.timing == "realtime":
-            self._hold(self._observation)
+        self._hold(self._observation)
         return None
 
     def answer(self, observation: Observation, values: Values) -> None:
@@ -246,7 +246,12 @@ class Session:
             self.actor.predictor = self._targets.of(version, data)
 
     def _hold(self, observation: Observation) -> None:
-        """Real time while the network trains: stand still for a period."""
+        """In real time, let the robot stand still for a period; in lockstep it waits anyway.
+
+        Without an answer it would stand still too, but the episode would be interrupted.
+        """
+        if self._me.config.robot.timing != "realtime":
+            return
         self._observation = None
         self._publish(
             Action(

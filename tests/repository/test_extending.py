@@ -161,11 +161,12 @@ import numpy as np
 from shared.rl.reward import episode_rewards
 from shared.settings import load
 
-config = load(env={"CORRIDOR_REWARD__TERMINAL": "-0.5"})
-rewards = episode_rewards(
-    np.zeros((3, 2)), np.zeros(3), bump=True, horizon=50, max_distance_m=1.0, config=config.reward
+config = load(env={"CORRIDOR_REWARD__DISTANCE_POWER": "2"}).reward
+way = np.array([[0.0, 0.0], [0.5, 0.0]])
+reward = episode_rewards(
+    way, np.zeros(1), bump=False, horizon=1, max_distance_m=1.0, config=config
 )
-assert rewards[-1] == -0.5
+assert reward == np.float32(0.8 * 0.25)
 """,
     ),
     "A message": Use(

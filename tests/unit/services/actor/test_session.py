@@ -1,0 +1,94 @@
+"""One robot at the actor: what it is answered while its last episode is on its way."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from builders import FakePredictor, make_config, make_observation
+
+from services.actor.courier import Delivery
+from services.actor.session import Newest, Session
+from shared.messages import Action, EpisodeAck, LearnerState, RobotProgress, image_array
+
+LEARNER = LearnerState(
+    id="main",
+    life="0123456789ab",
+    episode=5,
+    weights_version=1,
+    weights_hash="0" * 16,
+    activity="waiting",
+    loss=None,
+    train_steps=0,
+    fits=0,
+    target_age=0,
+    resyncs=0,
+    undecodable=0,
+)
+
+
+def progress(episodes: int) -> RobotProgress:
+    return RobotProgress(
+        robot="robot1",
+        filling=False,
+        fill_missing=0,
+        robot_fills=0,
+        robot_episodes=episodes,
+        episode=episodes,
+        robot_life="",
+        last_sequence=-1,
+    )
+
+
+class Rig:
+    """A session whose episodes are delivered when a test says so."""
+
+    def __init__(self, timing: str, folder: Path) -> None:
+        self.published: list[Action] = []
+        self.on_its_way: Future[Delivery] = Future()
+        me = SimpleNamespace(
+            config=make_config(robot={"timing": timing}),
+            bus=SimpleNamespace(publish=lambda _, action, __: self.published.append(action)),
+            insist=lambda *_: progress(0),
+        )
+        predictor = FakePredictor()
+        targets = SimpleNamespace(none=FakePredictor(version=0), of=lambda *_: predictor)
+        weights = SimpleNamespace(newest=(1, b""))
+        courier = SimpleNamespace(send=lambda _: self.on_its_way)
+        newest = Newest(LEARNER)
+        path = folder / "robot1.msgpack"
+        given: tuple[Any, ...] = (me, "robot1", path, newest, weights, targets, courier)
+        self.session = Session(*given)
+
+    def see(self, sequence: int, **given: Any) -> None:
+        """Let an observation come, and answer it if it may be answered."""
+        self.session.offer(make_observation(sequence, **given))
+        waiting = self.session.advance()
+        if waiting is not None:
+            image = image_array(waiting.image)
+            values = self.session.actor.predictor.all_values(image[np.newaxis])[0]
+            self.session.answer(waiting, values)
+
+
+@pytest.mark.parametrize("timing", ["lockstep", "realtime"])
+def test_a_robot_is_held_while_its_episode_is_on_its_way(timing: str, tmp_path: Path) -> None:
+    rig = Rig(timing, tmp_path)
+    rig.see(0)
+    assert rig.published[-1].action is not None
+    rig.see(1, bump=True)
+    rig.see(1, bump=True, attempt=1)
+    held = rig.published[1:]
+    if timing == "lockstep":  # simulated time stands still: there is nothing to say
+        assert held == []
+    else:
+        assert [(a.action, a.sequence, a.attempt) for a in held] == [(None, 1, 0), (None, 1, 1)]
+    ack = EpisodeAck(accepted=True, commit=1, episode=1, stored=1, progress=progress(1))
+    rig.on_its_way.set_result(Delivery(ack, attempts=1))
+    rig.see(1, bump=True, attempt=2)
+    assert rig.published[-1].action is not None
+    assert rig.published[-1].attempt == 2
+    assert rig.session.actor.dropped_samples == 0
