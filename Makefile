@@ -3,8 +3,9 @@
 #   make demo       install, then watch a simulated robot learn; Ctrl-C stops, again continues
 #   make test       install, then all checks and tests but the slow ones
 #
-# Variables: PYTHON (python3.11), ARGS (more options: for `corridor up` in demo, of bench-peers),
-# and TORCH_INDEX_URL: one of PyTorch's own package indexes, to choose a CPU-only or a CUDA build.
+# Variables: PYTHON (python3.11), ARGS (more options: for `corridor up` in demo, of mutants and
+# bench-peers), and TORCH_INDEX_URL: one of PyTorch's own package indexes, to choose a CPU-only or a
+# CUDA build.
 
 PYTHON ?= python3.11
 TORCH_INDEX_URL ?=
@@ -17,7 +18,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-full check lint unit system compose-test bench profile bench-full bench-peers clean
+.PHONY: help setup demo test test-full check lint unit system mutants compose-test bench profile bench-full bench-peers clean
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
 
@@ -50,6 +51,9 @@ unit: $(VENV)/.dev ## fast tests, two at a time
 # Real processes wait for each other: one test at a time.
 system: $(VENV)/.dev ## tests with real processes and a real router, without the slow ones
 	$(PYTEST) -m "not slow" tests/system tests/learning
+
+mutants: $(VENV)/.dev ## break one guarantee after the other in a copy: do its tests fail?
+	$(BIN)/python -m tests.mutate $(ARGS)
 
 compose-test: $(VENV)/.made ## images and containers, with kills; needs a Docker engine (docs/compose.md)
 	$(BIN)/python -m tests.compose.trial $(ARGS)

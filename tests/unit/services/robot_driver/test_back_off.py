@@ -67,6 +67,7 @@ class Recorder:
 
     def __init__(self, contacts: list[bool]) -> None:
         self.contacts, self.velocities, self.durations = contacts, [STANDSTILL], [0.0]
+        self.stopping: list[bool] = []
 
     def sense(self) -> Sensed:
         raise AssertionError("a recovery needs no picture")
@@ -79,6 +80,7 @@ class Recorder:
 
     def run(self, duration_s: float, *, stop_on_contact: bool) -> bool:
         self.durations.append(duration_s)
+        self.stopping.append(stop_on_contact)
         return False
 
 
@@ -92,3 +94,9 @@ def test_back_off_keeps_to_its_speed_and_distance_whatever_the_bumper_says():
         assert recorder.velocities[-1] == STANDSTILL
         straight = sum(recorder.durations[1:-1]) * CONFIG.recovery_speed_m_s
         assert straight <= CONFIG.recovery_distance_m + 1e-9
+
+
+def test_a_retreat_with_a_free_bumper_stops_at_contact():
+    recorder = Recorder([False] * 99)
+    back_off(recorder, CONFIG, 1.0)  # type: ignore[arg-type]
+    assert recorder.stopping == [True, False]  # the retreat, then the turn on the spot

@@ -361,6 +361,18 @@ def test_a_bump_seen_together_with_an_interruption_is_settled_first(interruption
     assert [step.sequence for step in actor.open.steps] == [7]
 
 
+def test_contact_of_a_motion_interrupts_the_episode_and_is_no_bump() -> None:
+    """E42: turning on the spot and creeping are no actions."""
+    (actor, _), replay = make_actor(), Replay()
+    actor.begin(progress(), observe(0))
+    for sequence in range(7):
+        drive(actor, replay, observe(sequence))
+    episode = actor.finish(observe(7, bump=True, interruption="moved"))
+    assert episode is not None
+    assert (episode.ended, sequences(episode)) == ("interrupted", [0, 1, 2])
+    assert episode.dropped_samples == 4
+
+
 def test_an_action_that_was_never_executed_is_neither_sample_nor_action() -> None:
     (actor, _), replay = make_actor(), Replay()
     actor.begin(progress(), observe(0))

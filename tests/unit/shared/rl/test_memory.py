@@ -289,6 +289,16 @@ def test_an_empty_store_answers_everything() -> None:
         store.ranks(np.array([1], np.uint64))
 
 
+@pytest.mark.parametrize("ids", [[7], [5, 8], [8, 8], [9, 8]])
+def test_insertion_numbers_grow_from_sample_to_sample_or_nothing_is_stored(ids: list[int]) -> None:
+    store = SampleStore()
+    fill_store(store, [3, 7], [0, 1])
+    before = snapshot(store)
+    with pytest.raises(ValueError, match="must grow"):
+        fill_store(store, ids, [0] * len(ids))
+    assert snapshot(store) == before
+
+
 def test_insertion_numbers_beyond_32_bits_are_kept_exactly() -> None:
     store = SampleStore()
     fill_store(store, [2**40, 2**53 + 1, 2**53 + 2, 2**62], [0, 1, 2, 0], images=make_images(4))

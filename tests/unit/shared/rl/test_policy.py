@@ -10,7 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shared.config import PolicyConfig
+from shared.config import Config, PolicyConfig
+from shared.rl.decision import decide
+from shared.rl.draws import generator
 from shared.rl.policy import choose, choose_uniformly, distribution
 
 Kind = Literal["eps-greedy", "roulette", "eps-greedy-roulette"]
@@ -147,3 +149,10 @@ def test_filling_actions_are_uniform() -> None:
     counts = np.bincount([choose_uniformly(rng) for _ in range(3000)], minlength=4)
     assert counts[3] == 0
     assert (abs(counts[:3] - 1000) < 130).all()
+
+
+def test_filling_draws_apart_from_driving() -> None:
+    config, values = Config(), np.zeros(3, np.float32)
+    draws = [generator(config.run.seed, "fill", "robot", 2, step) for step in range(50)]
+    filled = [decide(config, "robot", values, filling=True, episode=2, step=s) for s in range(50)]
+    assert filled == [(choose_uniformly(draw), False) for draw in draws]

@@ -86,8 +86,8 @@ def test_terminal_sample_bypasses_distance_and_prediction() -> None:
 
 
 def test_odometry_that_overshoots_is_clipped_to_one() -> None:
-    found = rewards([(0.0, 0.0), (99.0, 0.0)], [1.0], bump=False, horizon=1)
-    assert found == pytest.approx([1.0])
+    found = rewards([(0.0, 0.0), (99.0, 0.0)], [-1.0], bump=False, horizon=1)
+    assert found == pytest.approx([0.6])  # 0.8 of the distance, less 0.2 of the prediction
 
 
 def test_lowest_and_highest_reward_before_the_terminal_sample() -> None:

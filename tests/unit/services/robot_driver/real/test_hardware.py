@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -100,6 +101,19 @@ def test_it_stands_while_it_is_not_fit_and_can_go_on_after(
     moves(link)
 
 
+@pytest.mark.parametrize("sensor", ["camera", "odometry", "bumper"])
+def test_a_reading_of_every_sensor_grows_old(sensor: str, link: FakeLink) -> None:
+    hardware = config_of().robot.hardware
+    patient = {f"{name}_stale_s": 5.0 for name in ("camera", "odometry", "bumper")}
+    ages = hardware.model_copy(update={**patient, f"{sensor}_stale_s": 0.5})
+    config, ahead_s = config_of().robot.model_copy(update={"hardware": ages}), 0.0
+    robot = HardwareRobot(config, link, lambda: time.monotonic() + ahead_s)
+    ahead_s = 0.6
+    with pytest.raises(NotReady, match=f"{sensor}: nothing new for more than 0.5 s"):
+        robot.sense()
+    robot.close()
+
+
 def test_it_stands_even_if_the_driver_hangs_while_a_sensor_fails(
     robot: HardwareRobot, link: FakeLink
 ) -> None:
@@ -133,10 +147,19 @@ def test_a_driver_that_hung_is_told_so(link: FakeLink) -> None:
 
 
 def test_closing_sends_stops_and_lets_go_once(robot: HardwareRobot, link: FakeLink) -> None:
+    send, late = link.send, []
+
+    def noted(velocity: Velocity) -> None:
+        if robot._closing:
+            late.append(velocity)
+        send(velocity)
+
+    link.send = noted  # type: ignore[method-assign]
     robot.drive(AHEAD)
     moves(link)
     robot.close()
     robot.close()
+    assert sum(velocity.moving for velocity in late) <= 1  # one may have been on its way
     assert link.told[-ZEROS:] == [STANDSTILL] * ZEROS
     assert link.closed == 1
 

@@ -71,6 +71,7 @@ def test_reading_twice_gives_the_same_world_and_a_change_another_fingerprint(tmp
         ("centre = [0.0, 0.0]", "centre = [3.8, 0.0]", "lap.centre: a robot could drive over it"),
         ("segment = 0", "segment = 12", "fixtures.0.segment: 'outer' has 12 segments"),
         ("at_m = 1.0", "at_m = 0.4", "fixtures.0.at_m: does not fit onto a segment of 6.20 m"),
+        ("at_m = 1.0", "at_m = 6.0", "fixtures.0.at_m: does not fit onto a segment of 6.20 m"),
         ('wall = "outer"', 'wall = "inner"', "fixtures.0.wall: no wall named 'inner'"),
         ("height_m = 2.1", "height_m = 2.7", "fixtures.0.height_m: higher than the wall"),
         ('kind = "door"', 'kind = "gate"', "fixtures.0.kind: Input should be 'door'"),
