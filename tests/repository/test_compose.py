@@ -58,7 +58,7 @@ MODULES = {
     "driver-robotino": "services.robot_driver.service, services.robot_driver.real.hardware, "
     "services.robot_driver.real.robotino, services.monitor.health",
     "driver-ros2": "services.robot_driver.service, services.robot_driver.real.hardware, "
-    "services.monitor.health",
+    "services.robot_driver.real.ros2, services.monitor.health",
     "actor": "services.actor.service, services.monitor.health",
     "replay": "services.replay.service, services.monitor.health",
     "learner": "services.learner.service, services.monitor.health",

@@ -13,7 +13,6 @@ import math
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-import cv2
 import numpy as np
 
 from services.robot_driver.real.link import Battery
@@ -43,18 +42,8 @@ LOW_CHARGE = 0.15
 MAX_WAY_M = 1e6
 """Odometry beyond this is nonsense."""
 _CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1, "rgba8": 4, "bgra8": 4}
-_TO_RGB = {
-    "bgr8": cv2.COLOR_BGR2RGB,
-    "mono8": cv2.COLOR_GRAY2RGB,
-    "rgba8": cv2.COLOR_RGBA2RGB,
-    "bgra8": cv2.COLOR_BGRA2RGB,
-}
-_FROM_RGB = {
-    "bgr8": cv2.COLOR_RGB2BGR,
-    "mono8": cv2.COLOR_RGB2GRAY,
-    "rgba8": cv2.COLOR_RGB2RGBA,
-    "bgra8": cv2.COLOR_RGB2BGRA,
-}
+_GREY = np.array([9798, 19235, 3735])
+"""BT.601 weights of red, green and blue, in parts of 2^15."""
 
 
 @dataclass(frozen=True)
@@ -110,9 +99,25 @@ def decode_camera(raw: bytes, kind: CameraType) -> Stamped[RgbImage]:
         )
     rows = message.data.reshape(height, step)[:, : width * channels]
     pixels = np.ascontiguousarray(rows).reshape(height, width, channels)
-    code = _TO_RGB.get(message.encoding)
-    rgb = pixels if code is None else cv2.cvtColor(pixels, code)
-    return Stamped(np.asarray(rgb, np.uint8), stamp_ns_of(message))
+    return Stamped(_to_rgb(pixels, message.encoding), stamp_ns_of(message))
+
+
+def _to_rgb(pixels: RgbImage, encoding: str) -> RgbImage:
+    """Pixels of one of the `_CHANNELS` as uint8 [h, w, 3], RGB."""
+    if encoding == "mono8":
+        return np.repeat(pixels, 3, axis=2)
+    order = [2, 1, 0] if encoding.startswith("bgr") else [0, 1, 2]
+    return np.ascontiguousarray(pixels[:, :, order])
+
+
+def _from_rgb(rgb: RgbImage, encoding: str) -> RgbImage:
+    """An RGB picture as uint8 [h, w, channels] of an encoding; alpha is opaque."""
+    if encoding == "mono8":
+        grey = (rgb @ _GREY + (1 << 14)) >> 15
+        return np.asarray(grey[:, :, np.newaxis], np.uint8)
+    pixels = rgb[:, :, ::-1] if encoding.startswith("bgr") else rgb
+    opaque = _CHANNELS[encoding] == 4
+    return np.pad(pixels, ((0, 0), (0, 0), (0, int(opaque))), constant_values=255)
 
 
 def decode_bumper(raw: bytes, kind: BumperType) -> Stamped[bool]:
@@ -200,10 +205,8 @@ def encode_image(
     little_endian: bool = True,
 ) -> bytes:
     """An uncompressed picture; `padding` bytes follow every row."""
-    code = _FROM_RGB.get(encoding)
-    pixels = rgb if code is None else np.asarray(cv2.cvtColor(rgb, code), np.uint8)
     height, width = rgb.shape[:2]
-    rows = pixels.reshape(height, width * _CHANNELS[encoding])
+    rows = _from_rgb(rgb, encoding).reshape(height, width * _CHANNELS[encoding])
     if padding:
         rows = np.pad(rows, ((0, 0), (0, padding)))
     message = new(

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-import cv2
+import io
+import zlib
+
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 
 from shared.errors import BadMessage
 
@@ -36,14 +39,12 @@ def decoded(data: bytes) -> RgbImage:
     if size is None or not all(0 < side <= MAX_SIDE_PX for side in size):
         raise BadMessage("picture of unusable size")
     try:
-        bgr = cv2.imdecode(
-            np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        )
-    except cv2.error as error:
+        with Image.open(io.BytesIO(data), formats=["JPEG", "PNG"]) as picture:
+            if picture.mode.startswith(("I", "F")):
+                raise BadMessage(f"picture is not of 8 bits: {picture.mode}")
+            return np.asarray(picture.convert("RGB"), np.uint8)
+    except (OSError, SyntaxError, ValueError, zlib.error) as error:  # as Pillow says it is broken
         raise BadMessage("picture cannot be decoded") from error
-    if bgr is None:
-        raise BadMessage("picture cannot be decoded")
-    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def _png_size(data: bytes) -> tuple[int, int] | None:
