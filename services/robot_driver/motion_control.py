@@ -82,7 +82,7 @@ class MotionControl:
         self._drive(STANDSTILL)
 
     def back_off(self, sequence: int) -> bool:
-        """After a bump: retreat by real motion and turn to a random heading (E11).
+        """Retreat from a bump by real motion, then turn to a random heading (E11).
 
         The heading is drawn from the seed and the sequence number. False: it broke off.
         """
@@ -95,7 +95,7 @@ class MotionControl:
         return False
 
     def let_go(self) -> None:
-        """After contact in a straight motion: back the way it came until the bumper is free."""
+        """Drive back the way the robot came, until the bumper is free."""
         direction = {"forward": -1.0, "back": 1.0}.get(self.motion)
         if direction is not None:
             with self._recovering() as watched:
