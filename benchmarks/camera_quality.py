@@ -1,6 +1,7 @@
 """P6: what the camera's quality means for learning: bumps of policies learnt at two sizes.
 
-The simulator renders at 75x50, cheap and aliased, or at 150x100, reduced to 75x50 by area. For each
+The simulator renders at the size of the network's image, cheap and aliased, or at twice that size,
+reduced by area. For each
 of three seeds and either size a narrow network learns in the single-process loop for the same
 number of actions; then it drives greedily, without learning, from the same starts, at the size it
 has learnt at. Runs take minutes each: they are stored one by one, and a later call goes on.
@@ -34,12 +35,13 @@ from experiments.single_process import SingleProcess
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import load_world
 from shared.config import Config
+from shared.facts import IMAGE_HEIGHT, IMAGE_WIDTH
 from shared.provenance import commit
 
 LONG = True
 """Too long for short measuring: the stored results stay as they are then."""
 CACHE = Path(__file__).parent / ".cache"
-HEIGHTS = {75: 50, 150: 100}
+HEIGHTS = {IMAGE_WIDTH: IMAGE_HEIGHT, 2 * IMAGE_WIDTH: 2 * IMAGE_HEIGHT}
 """Height rendered by width; the first is the configured default."""
 FITNESS_OF_LAST = 100
 """Episodes, as everywhere fitness is shown."""
@@ -94,7 +96,7 @@ def config_of(plan: Plan, seed: int, width: int) -> Config:
     """The configuration of a run: the demo's way of learning, but narrower and exploring more.
 
     Roulette tries only what is almost as good as the best. Where an untrained network prefers a
-    turn, that is the turn alone: at 75x50 two of three seeds did nothing but circle after 30,000
+    turn, that is the turn alone: at the smaller size two of three seeds did nothing but circle after 30,000
     actions. Uniform exploration, in all runs, ends that early.
     """
     camera = {"render_width_px": width, "render_height_px": HEIGHTS[width]}

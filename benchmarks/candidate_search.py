@@ -19,6 +19,7 @@ import numpy.typing as npt
 from benchmarks import frames
 from benchmarks.frame import Bar, Mode, interleaved, mode_of, report, rounds_of, table
 from shared.config import MemoryConfig, Numerics
+from shared.facts import IMAGE_SHAPE
 from shared.provenance import ROOT
 from shared.rl.memory import SAMPLE, ReplayMemory
 from shared.rl.predictor import Predictor
@@ -204,7 +205,7 @@ def episode_turn(mode: Mode) -> tuple[Bar, str]:
 def fill_up(memory: ReplayMemory) -> None:
     """Append black images up to the capacity, half of them marked."""
     while missing := min(4096, memory.capacity - len(memory)):
-        memory.append(next_rows(memory, missing), np.zeros((missing, 50, 75), np.uint8))
+        memory.append(next_rows(memory, missing), np.zeros((missing, *IMAGE_SHAPE), np.uint8))
 
 
 def next_rows(memory: ReplayMemory, count: int) -> npt.NDArray[np.void]:

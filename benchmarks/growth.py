@@ -22,6 +22,7 @@ import numpy as np
 
 from benchmarks.frame import Bar, Mode, mode_of, report, table
 from shared.config import MemoryConfig
+from shared.facts import IMAGE_SHAPE
 from shared.provenance import ROOT
 from shared.rl.memory import SAMPLE, ReplayMemory
 from shared.rl.retention.rmm import recompute_marks
@@ -72,7 +73,7 @@ def append_black(memory: ReplayMemory, count: int, draw: np.random.Generator) ->
     while count > 0:
         some = min(5000, count)
         first = int(memory.ids[-1]) + 1 if len(memory) else 1
-        memory.append(rows_of(first, some, draw), np.zeros((some, 50, 75), np.uint8))
+        memory.append(rows_of(first, some, draw), np.zeros((some, *IMAGE_SHAPE), np.uint8))
         count -= some
 
 
@@ -90,7 +91,7 @@ def measure(size: int, rounds: int) -> Times:
         for _ in range(3 if size < 100_000 else 1)
     ]
     memory.rows["candidate"], memory.rows["marked_by"] = True, 1
-    images, appends, both = np.zeros((EPISODE_SAMPLES, 50, 75), np.uint8), [], []
+    images, appends, both = np.zeros((EPISODE_SAMPLES, *IMAGE_SHAPE), np.uint8), [], []
     for _ in range(rounds):
         append_black(memory, size - len(memory), draw)  # or there would be nothing to discard
         rows = rows_of(int(memory.ids[-1]) + 1, EPISODE_SAMPLES, draw)

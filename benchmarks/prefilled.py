@@ -18,6 +18,7 @@ from shared import settings
 from shared.bus import Bus
 from shared.config import Config
 from shared.errors import BusError, RouterMissing
+from shared.facts import ACTION_COUNT, IMAGE_BYTES
 from shared.keys import PROGRESS
 from shared.messages import Episode, ProgressRequest, RobotProgress
 from shared.rl.memory import ReplayMemory
@@ -47,8 +48,8 @@ def make_episode(number: int, samples: int, *, fill: bool, images: Images | None
         dropped_samples=0,
         dropped_episodes=0,
         worlds=("plus",),
-        images=rng.bytes(samples * 3750) if images is None else images.tobytes(),
-        sample_actions=rng.integers(0, 3, samples, np.uint8).tobytes(),
+        images=rng.bytes(samples * IMAGE_BYTES) if images is None else images.tobytes(),
+        sample_actions=rng.integers(0, ACTION_COUNT, samples, np.uint8).tobytes(),
         sample_rewards=rng.uniform(-0.9, 0.9, samples).astype("<f4").tobytes(),
         sample_steps=np.arange(samples, dtype="<u4").tobytes(),
         sample_episodes=np.full(samples, number, "<u4").tobytes(),

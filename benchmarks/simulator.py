@@ -20,8 +20,9 @@ from services.robot_driver.robot import Velocity
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import load_world
 from shared.config import Config, RobotConfig
+from shared.facts import ACTION_COUNT, IMAGE_HEIGHT, IMAGE_WIDTH
 
-SIZES = ((75, 50), (150, 100))
+SIZES = ((IMAGE_WIDTH, IMAGE_HEIGHT), (2 * IMAGE_WIDTH, 2 * IMAGE_HEIGHT))
 """Width and height rendered; the first is the configured default."""
 
 
@@ -38,7 +39,7 @@ def drive(robots: Sequence[SimRobot], actions: int) -> tuple[list[list[float]], 
     config, draw = Config(), np.random.default_rng(0)
     seen: list[list[float]] = [[] for _ in robots]
     moved: list[float] = []
-    for action in draw.integers(0, 3, actions):
+    for action in draw.integers(0, ACTION_COUNT, actions):
         velocity = action_velocity(config, int(action))
         for robot, spent in zip(robots, seen, strict=True):
             robot.drive(velocity)

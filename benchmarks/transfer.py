@@ -32,6 +32,7 @@ from services.learner.mirror import Mirror
 from shared import settings
 from shared.bus import Bus
 from shared.config import ActorNumerics, Config
+from shared.facts import IMAGE_BYTES
 from shared.inbox import Inbox
 from shared.keys import EPISODE, LEARNER_STATE, REPLAY_STATE, WEIGHTS
 from shared.messages import EpisodeAck, LearnerState, ReplayState
@@ -64,7 +65,7 @@ def snapshot_rate(client: Bus) -> float:
     mirror = Mirror()
     start_s = time.perf_counter()
     mirror.reach(client, 1)
-    return len(mirror.samples) * 3750 / 1e6 / (time.perf_counter() - start_s)
+    return len(mirror.samples) * IMAGE_BYTES / 1e6 / (time.perf_counter() - start_s)
 
 
 def acknowledged(client: Bus, first: int, count: int) -> list[float]:

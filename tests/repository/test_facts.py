@@ -14,7 +14,7 @@ from shared import facts
 ROOT = Path(__file__).parents[2]
 FILES = sorted(
     path
-    for package in ("shared", "services", "experiments")
+    for package in ("shared", "services", "experiments", "benchmarks")
     for path in (ROOT / package).rglob("*.py")
     if path != ROOT / "shared" / "facts.py"
 )
