@@ -1,10 +1,10 @@
 """P6: what the camera's quality means for learning: bumps of policies learnt at two sizes.
 
 The simulator renders at the size of the network's image, cheap and aliased, or at twice that size,
-reduced by area. For each
-of three seeds and either size a narrow network learns in the single-process loop for the same
-number of actions; then it drives greedily, without learning, from the same starts, at the size it
-has learnt at. Runs take minutes each: they are stored one by one, and a later call goes on.
+reduced by area. For each of three seeds and either size a narrow network learns in the
+single-process loop for the same number of actions. Then it drives greedily, without learning, from
+the same starts, at the size it has learnt at. Runs take minutes each. They are stored one by one,
+and a later call goes on.
 
     python -m benchmarks.camera_quality [--jobs 2 | --check]
 """
@@ -96,8 +96,8 @@ def config_of(plan: Plan, seed: int, width: int) -> Config:
     """The configuration of a run: the demo's way of learning, but narrower and exploring more.
 
     Roulette tries only what is almost as good as the best. Where an untrained network prefers a
-    turn, that is the turn alone: at the smaller size two of three seeds did nothing but circle after 30,000
-    actions. Uniform exploration, in all runs, ends that early.
+    turn, that is the turn alone: at the smaller size two of three seeds did nothing but circle
+    after 30,000 actions. Uniform exploration, in all runs, ends that early.
     """
     camera = {"render_width_px": width, "render_height_px": HEIGHTS[width]}
     learning = {"fit_every": plan.fit_every, "mini_batches_per_episode": plan.mini_batches}
