@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from experiments.drives.choosers import GREEDY
-from experiments.drives.tour import BOX_NAME, drive_tour, route_share
+from experiments.drives.routes import Route
+from experiments.drives.tour import BOX_NAME, Tour, drive_tour, route_share
+from experiments.drives.traces import Trace
 from experiments.environment import CorridorEnv
 from services.robot_driver.robot import Pose
 from services.robot_driver.simulated.world import load_world
@@ -96,6 +99,18 @@ def test_a_policy_may_choose_what_seems_as_good(env: CorridorEnv) -> None:
         ways.append(np.unwrap(tour.route.trace.headings_rad[:6]))
     assert np.ptp(ways[0]) < 1e-6
     assert np.ptp(ways[1]) > 0.01
+
+
+def test_a_full_drive_past_the_box_without_a_bump_passes_and_nothing_less() -> None:
+    still = np.zeros(3)
+    trace = Trace("i16c", np.array([False, False]), np.zeros((3, 2)), still, still[1:], 0, 0)
+    full = Tour(Route(trace), 300, 9, 0.6, ("west", "east"), True)
+    assert full.passed
+    assert not replace(full, driven=299).passed
+    assert not replace(full, route_share=0.59).passed
+    assert not replace(full, bridges=("west",)).passed
+    assert not replace(full, box_dropped=False).passed
+    assert not replace(full, route=Route(replace(trace, bumps=np.array([False, True])))).passed
 
 
 def test_the_share_of_the_route_is_that_of_its_length() -> None:

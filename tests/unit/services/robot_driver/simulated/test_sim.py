@@ -182,6 +182,14 @@ def test_restored_in_the_same_process_it_continues_bit_for_bit(robot: SimRobot):
     assert drive_on(robot, np.random.default_rng(2), 60) == first
 
 
+def test_a_restored_robot_keeps_its_laps(robot: SimRobot):
+    saved = fresh(robot).state()
+    robot.restore({**saved, "laps_left": 3, "laps_right": 1})
+    assert robot.laps == (2, 3, 1)
+    robot.restore(saved)
+    assert robot.laps == (0, 0, 0)
+
+
 CONTINUE = """
 import hashlib, json, sys
 import numpy as np
