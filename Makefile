@@ -52,7 +52,7 @@ unit: $(VENV)/.dev ## fast tests, two at a time
 system: $(VENV)/.dev ## tests with real processes and a real router, without the slow ones
 	$(PYTEST) -m "not slow" tests/system tests/learning
 
-mutants: $(VENV)/.dev ## break one guarantee after the other in a copy: do its tests fail?
+mutants: $(VENV)/.dev ## break one guarantee after the other in a copy: do its tests fail? (minutes)
 	$(BIN)/python -m tests.mutate $(ARGS)
 
 compose-test: $(VENV)/.made ## images and containers, with kills; needs a Docker engine (docs/compose.md)

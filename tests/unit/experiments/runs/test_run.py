@@ -293,6 +293,11 @@ def test_a_run_without_its_predecessor_is_refused(tmp_path: Path) -> None:
         run(SECOND, tmp_path / "two", tmp_path / "one")
 
 
+def test_a_predecessor_of_another_seed_is_refused(finished: Path, tmp_path: Path) -> None:
+    with pytest.raises(StateError, match="expected a checkpoint of"):
+        Run(SECOND, "full", 2, tmp_path / "x" / "two", finished / "one", "corridor experiment two")
+
+
 def test_the_folder_of_another_seed_is_refused(finished: Path) -> None:
     with pytest.raises(ConfigError, match=r"run\.seed is 1 there, but 2 now"):
         Run(FIRST, "full", 2, finished / "one", None, "command")
