@@ -48,9 +48,8 @@ lint: $(VENV)/.dev ## style only
 unit: $(VENV)/.dev ## fast tests, two at a time
 	$(PYTEST) -n 2 -m "not slow" tests/unit tests/repository tests/contract
 
-# Real processes wait for each other: one test at a time.
-system: $(VENV)/.dev ## tests with real processes and a real router, without the slow ones
-	$(PYTEST) -m "not slow" tests/system tests/learning
+system: $(VENV)/.dev ## tests with real processes and a real router, without the slow ones, two at a time
+	$(PYTEST) -n 2 -m "not slow" tests/system tests/learning
 
 mutants: $(VENV)/.dev ## break one guarantee after the other in a copy: do its tests fail? (minutes)
 	$(BIN)/python -m tests.mutate $(ARGS)

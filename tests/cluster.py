@@ -28,8 +28,8 @@ ALL = tuple(process.name for process in processes.PROCESSES)
 
 
 WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-_ports = itertools.count(20_000 + 1000 * WORKER)
-"""Below the ports that the system gives to clients, and other ones for each worker."""
+_ports = itertools.count(30_000 + 900 * WORKER)
+"""Other ports for each worker. Neither `corridor up` nor the system gives these to anybody."""
 
 
 def free_port() -> int:
