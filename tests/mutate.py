@@ -27,10 +27,11 @@ from tempfile import TemporaryDirectory
 ROOT = Path(__file__).parents[1]
 LIST = Path(__file__).with_name("mutants.toml")
 DEADLINE_S = 300.0
-"""For the tests of one mutant. pytest ends a single test that hangs before."""
+"""For the tests of one mutant. A test that hangs, or is slow, is none that fails."""
 WORDS = {0: "SURVIVED", 1: "caught", None: f"tests do not end within {DEADLINE_S:.0f} s"}
 """By exit code of pytest. Any other one means that the tests could not be run."""
 NOT_RUN = 70
+"""Exit code where pytest itself fails."""
 _PROCESSES = multiprocessing.get_context("forkserver")
 _PROCESSES.set_forkserver_preload(["pydantic", "pytest", "torch", "zenoh"])
 
@@ -104,9 +105,10 @@ def _test(tree: str, arguments: Sequence[str], aloud: bool) -> None:
         os.dup2(nowhere, 2)
     code = NOT_RUN
     try:
-        code = int(pytest.main(["-q", "-p", "no:cacheprovider", *arguments]))
+        options = ("-q", "-p", "no:cacheprovider", "--timeout=0")
+        code = int(pytest.main([*options, *arguments]))
     finally:
-        sys.exit(code)  # also where pytest itself fails: that is no failed test
+        sys.exit(code)  # an exception would give 1, as a failed test does
 
 
 def _copy_to(folder: Path) -> None:
