@@ -28,7 +28,7 @@ ALL = tuple(process.name for process in processes.PROCESSES)
 
 
 WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-_ports = itertools.count(30_000 + 900 * WORKER)
+_ports = itertools.count(30_000 + 600 * WORKER)
 """Other ports for each worker. Neither `corridor up` nor the system gives these to anybody."""
 
 

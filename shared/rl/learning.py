@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from torch import Tensor
+from torch.optim.rmsprop import rmsprop
 
 from shared.rl.batches import Batches, Mask, Ranks
 from shared.rl.draws import generator
@@ -50,12 +51,11 @@ class Trainer:
         self.target_network = QNetwork(network).to(numerics.device)
         self.target_network.load_state_dict(self.train_network.state_dict())
         self.target_network.requires_grad_(False)
-        self._optimiser = torch.optim.RMSprop(
-            self.train_network.parameters(),
-            lr=learning.learning_rate,
-            alpha=learning.rmsprop_alpha,
-            eps=learning.rmsprop_epsilon,
-        )
+        self._parameters: list[Tensor] = list(self.train_network.parameters())
+        self._squares = [torch.zeros_like(parameter) for parameter in self._parameters]
+        """State of RMSprop: moving averages of the squared gradients, one for each parameter."""
+        self._steps = [torch.zeros(()) for _ in self._parameters]
+        """RMSprop counts its steps here. Nothing depends on them."""
         self.gradients = Gradients(self.train_network, numerics)
         self._mean = MeanOfWeights(self.train_network)
         """It begins anew with each epoch and each episode."""
@@ -69,8 +69,6 @@ class Trainer:
     def configure(self, learning: LearningConfig) -> None:
         """Go on with another schedule, target rule or rate. Call between episodes."""
         self._learning = learning
-        for group in self._optimiser.param_groups:
-            group["lr"] = learning.learning_rate
 
     def learn(self, samples: SampleStore, episode: int) -> Iterator[Trained]:
         """Everything the network learns at one episode (E25); yields after each mini-batch.
@@ -117,11 +115,7 @@ class Trainer:
         state: dict[str, Tensor] = {}
         for role, network in (("train", self.train_network), ("target", self.target_network)):
             state |= {f"{role}.{name}": t.detach() for name, t in network.state_dict().items()}
-        for name, parameter in self.train_network.named_parameters():
-            moments = self._optimiser.state.get(parameter)
-            square = moments["square_avg"] if moments else torch.zeros_like(parameter)
-            state[f"square_avg.{name}"] = square.detach()
-        return state
+        return state | dict(zip(self._square_names(), self._squares, strict=True))
 
     def counters(self) -> dict[str, int]:
         """All counters of the state, for a checkpoint."""
@@ -136,13 +130,13 @@ class Trainer:
             for role, network in (("train", self.train_network), ("target", self.target_network)):
                 for name, own in network.named_parameters():
                     _copy_checked(own, tensors[f"{role}.{name}"], f"{role}.{name}")
-        for name, parameter in self.train_network.named_parameters():
-            square = torch.zeros_like(parameter)
-            _copy_checked(square, tensors[f"square_avg.{name}"], f"square_avg.{name}")
-            self._optimiser.state[parameter] = {
-                "step": torch.tensor(float(self.train_steps)),
-                "square_avg": square,
-            }
+        for name, square in zip(self._square_names(), self._squares, strict=True):
+            _copy_checked(square, tensors[name], name)
+
+    def _square_names(self) -> Iterator[str]:
+        """Yield the names of the optimiser's tensors in a checkpoint."""
+        for name, _ in self.train_network.named_parameters():
+            yield f"square_avg.{name}"
 
     def _mini_batches(self, samples: SampleStore, episode: int) -> Iterator[Trained]:
         """Mini-batches without replacement, drawn by rank of insertion number (E30)."""
@@ -191,11 +185,33 @@ class Trainer:
         except FloatingPointError as error:
             raise FloatingPointError(f"{error} at training step {self.train_steps}") from None
         with arithmetic(self._numerics):
-            self._optimiser.step()
+            self._descend()
             if self._learning.target_average:
                 self._mean.take()
         self.train_steps += 1
         return loss
+
+    @torch.no_grad()
+    def _descend(self) -> None:
+        """Let RMSprop change the weights by the newest gradient (A25, E30).
+
+        The function, and not `torch.optim.RMSprop`: the class imports a compiler, for a second.
+        """
+        learning = self._learning
+        rmsprop(
+            self._parameters,
+            [parameter.grad for parameter in self._parameters if parameter.grad is not None],
+            self._squares,
+            [],
+            [],
+            self._steps,
+            lr=learning.learning_rate,
+            alpha=learning.rmsprop_alpha,
+            eps=learning.rmsprop_epsilon,
+            weight_decay=0.0,
+            momentum=0.0,
+            centered=False,
+        )
 
 
 def _copy_checked(own: Tensor, given: Tensor, name: str) -> None:
