@@ -30,7 +30,9 @@ setup: $(VENV)/.dev ## make the virtual environment with everything in it
 demo: $(VENV)/.all ## install what is needed, then run the demo until Ctrl-C
 	@$(BIN)/corridor up --preset demo $(ARGS)
 
-test: check unit system ## all checks and tests but the slow ones
+# Four at a time: most tests that take long wait for something.
+test: check ## all checks and tests but the slow ones
+	$(PYTEST) -n 4 -m "not slow" tests
 
 test-full: check ## all checks and tests
 	$(PYTEST) -n 2 tests/unit tests/repository tests/contract
@@ -45,11 +47,11 @@ lint: $(VENV)/.dev ## style only
 	$(BIN)/ruff format --check .
 	$(BIN)/mdformat --check README.md benchmarks/results.md $(filter-out docs/results.md,$(wildcard docs/*.md))
 
-unit: $(VENV)/.dev ## fast tests, two at a time
-	$(PYTEST) -n 2 -m "not slow" tests/unit tests/repository tests/contract
+unit: $(VENV)/.dev ## fast tests
+	$(PYTEST) -n 4 -m "not slow" tests/unit tests/repository tests/contract
 
-system: $(VENV)/.dev ## tests with real processes and a real router, without the slow ones, two at a time
-	$(PYTEST) -n 2 -m "not slow" tests/system tests/learning
+system: $(VENV)/.dev ## tests with real processes and a real router, without the slow ones
+	$(PYTEST) -n 4 -m "not slow" tests/system tests/learning
 
 mutants: $(VENV)/.dev ## break one guarantee after the other in a copy: do its tests fail? (minutes)
 	$(BIN)/python -m tests.mutate $(ARGS)
