@@ -1,4 +1,4 @@
-"""From presets, files, environment and command line to one checked `Config`, and back to TOML.
+"""Merges presets, files, environment and command line into one checked `Config`; writes TOML.
 
 Later sources win: defaults < preset < file < environment < command line. Whatever cannot work is
 refused here, before anything starts, with one `ConfigError` line that names the key, what was

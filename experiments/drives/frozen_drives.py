@@ -55,7 +55,7 @@ def drive_from_first_start(env: CorridorEnv, choose: Chooser, actions: int = ACT
 
 
 def drive(env: CorridorEnv, choose: Chooser, number: int, pose: Pose, actions: int) -> Trace:
-    """One drive of so many actions from a pose; after a bump the driver recovers as always.
+    """Drive this many actions from a pose. After a bump the driver recovers as always.
 
     Args:
         env: Without a wrapper.

@@ -117,7 +117,7 @@ class Plan(Section):
     tour_policy: PolicyConfig = PolicyConfig(kind="eps-greedy", epsilon=0.0)
     """How actions are chosen on them (E33): greedily, or with some chance of what seems as good."""
     seeds: Annotated[tuple[int, ...], Field(min_length=1, strict=False)] = (1, 2, 3, 4, 5)
-    """Fixed before any run: a comparison takes the first so many of them."""
+    """Seeds, fixed before any run. A comparison takes the first ones."""
     evaluation: Evaluation = Evaluation()
     mini: Mini
 

@@ -203,7 +203,7 @@ class Run:
         snapshot.replace(self.folder, snapshot.END, self._loop, self._extra())
 
     def _check_lap(self) -> None:
-        """Whether the frozen policy drives a lap already, looked at every so many actions."""
+        """Whether the frozen policy drives a lap already. It looks only when a check is due."""
         every, actions = self.plan.evaluation.lap_every_actions, self._all_actions
         world = self._loop.env.robot.world
         if not every or self._totals.first_lap or world.lap is None:

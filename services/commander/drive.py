@@ -111,7 +111,7 @@ def run(
     actions: int,
     echo: Callable[[str], None],
 ) -> int:
-    """Drive until stopped, or until so many actions are done.
+    """Drive until stopped, or until the wanted number of actions is done.
 
     Args:
         config: How to reach the run, and its robot.

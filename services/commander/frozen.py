@@ -31,7 +31,7 @@ class Frozen:
     train_steps: int | None = None
 
     def predictor(self, network: NetworkConfig) -> Predictor:
-        """The network ready to predict, with the same arithmetic wherever and whatever it learnt.
+        """The network ready to predict, with the same arithmetic as in its run.
 
         Raises:
             ConfigError: It is not of this shape.

@@ -1,4 +1,4 @@
-"""From bytes of a terminal to keys, and from keys to what a person wants: pure, time is given."""
+"""Turns bytes of a terminal into keys, and keys into what a person wants. It has no clock."""
 
 from __future__ import annotations
 

@@ -213,7 +213,7 @@ def _furnish(robot: ChangeableWorld, world: World, obstacles: tuple[Obstacle, ..
 
 
 def _after(change: WorldChange, world: World, names: set[str]) -> tuple[World, set[str]]:
-    """World and obstacles after a change, as far as names go."""
+    """World and names of the obstacles after a change."""
     if change.box is not None:
         return world, names | {change.box.name}
     if change.name is not None:

@@ -84,7 +84,7 @@ class Trainer:
             yield from self._mini_batches(samples, episode)
 
     def fit_batches(self, samples: int) -> int:
-        """Mini-batches of a whole fitting phase over so many samples."""
+        """Mini-batches of a whole fitting phase over this number of samples."""
         return self._learning.fit_epochs * -(-samples // self._learning.batch_size)
 
     def apply_target_rule(self, episode: int, bump: bool) -> bool:

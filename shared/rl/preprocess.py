@@ -1,4 +1,4 @@
-"""From a camera frame to the network's input image (A22, E29): resize, then grey, in that order.
+"""Makes the network's image of a camera frame (A22, E29): resize first, then grey.
 
 The rounding is part of the definition, so that simulation, hardware drivers and tests agree to
 the last bit, whatever the processor: exact means over areas, and each step ends in uint8, rounded

@@ -17,7 +17,7 @@ Mask = npt.NDArray[np.bool_]
 ROWS = 512
 """Rows compared at a time."""
 NEWER = 8 * ROWS
-"""Newer rows they are compared with at a time, while there are so many; else again `ROWS`."""
+"""Newer rows that rows are compared with at a time. Fewer are taken `ROWS` at a time."""
 STEP = 128
 """Open rows are filled up to a multiple of it."""
 

@@ -1,4 +1,4 @@
-"""One turn in the order of E25, as far as it concerns the memory.
+"""What one turn does to the memory, in the order of E25.
 
 append -> discard -> equalise -> (the learner:) train or fit -> target rule -> checkpoint ->
 publish. The replay service and the single-process loop both call these.

@@ -49,7 +49,7 @@ _RC = {
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """A drawing function in our style, whatever matplotlib is set to elsewhere."""
+    """Make a function draw in our style, however matplotlib is configured."""
 
     @wraps(draw)
     def inner(*args: P.args, **kwargs: P.kwargs) -> Figure:

@@ -1,4 +1,4 @@
-"""What is possible with full knowledge of the map and the three actions (A4, A21).
+"""What is possible with full knowledge of the map and the actions (A4, A21).
 
 Two tables over a grid of positions and headings come from value iteration: how much room the best
 run of `horizon` actions keeps at its narrowest place, and how fast laps can be driven. Tables

@@ -91,7 +91,7 @@ def survey(config: Config, world: World) -> Figures:
 
 
 def drive_randomly(robot: SimRobot, bumps: int, seed: int) -> RandomDrive:
-    """Drive uniformly random actions until so many bumps, each followed by `back_off` (E9, E11)."""
+    """Drive random actions until this many bumps, each followed by `back_off` (E9, E11)."""
     config = robot.config
     draw = np.random.default_rng(seed)
     turns = [turn * config.turn_rad_s for turn in TURNS]

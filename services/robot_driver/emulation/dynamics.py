@@ -26,7 +26,7 @@ class BaseDynamics:
     """Figures of one kind of base."""
 
     delay_s: float
-    """From a command's arrival until the wheels begin to follow it."""
+    """Delay from a command's arrival until the wheels begin to follow it."""
     accel_m_s2: float
     decel_m_s2: float
     turn_accel_rad_s2: float
@@ -122,7 +122,7 @@ class EmulatedBase:
         self.stalled = False
         """Fault: the motors do not turn, whatever is commanded."""
         self.sequence = 0
-        """Number of the odometry reading, one more with each step."""
+        """Number of the odometry reading. It grows by one with each step."""
         self.still_since_s: float | None = now_s
         """Since when the wheels stand; None while they turn."""
         self.watchdog_stops = 0

@@ -31,7 +31,7 @@ class Gate:
         """A hanging driver's robot is told to stop after this: one period, so that a robot with
         its own delay stands still within two and that delay."""
         self.problem = ""
-        """Why the robot must not move whatever the driver wants; empty when it may."""
+        """Why the robot must not move; empty when it may."""
         self.lease_stops = 0
         self.lapsed = False
         """The lease ran out since the driver last set a velocity."""

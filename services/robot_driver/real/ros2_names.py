@@ -68,7 +68,7 @@ def rmw_type(type_name: str) -> str:
 
 
 def rmw_key(domain: int, topic: str, type_name: str, type_hash: str) -> str:
-    """Key of a topic on rmw_zenoh; `ANY_HASH` to subscribe whatever the hash."""
+    """Key of a topic on rmw_zenoh. With `ANY_HASH` it matches every hash."""
     return f"{domain}/{topic}/{rmw_type(type_name)}/{type_hash}"
 
 
