@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import get_args
 
 from rich.console import Console
 
 from experiments.plans.plan import SCALES, Scale, load_plan, plan_names
+from experiments.plans.scale_model import description
 from experiments.runs.schedule import OUT, run_experiment
 from shared.errors import ConfigError
 
@@ -24,18 +24,28 @@ def listing() -> str:
     )
 
 
+def described(names: Sequence[str], scale: str) -> str:
+    """How much of the plans a scale keeps. Raises ConfigError."""
+    return "\n\n".join(description(name, _chosen(scale)) for name in names)
+
+
 def run(
     names: Sequence[str], scale: str, seeds: int, seed: int | None, jobs: int, out: Path | None
 ) -> int:
     """Run them; returns 0, or 1 when stopped before the end. Raises ConfigError, CorridorError."""
-    chosen = [each for each in get_args(Scale) if each == scale]
-    if not chosen:
-        raise ConfigError(f"--scale: expected one of {', '.join(SCALES)}, got {scale!r}")
+    chosen = _chosen(scale)
     wanted = seeds if seed is None else [seed]
     for name in names:
-        available = load_plan(name, chosen[0]).seeds
+        available = load_plan(name, chosen).seeds
         if isinstance(wanted, int) and wanted > len(available):
             raise ConfigError(f"--seeds: {name} has {len(available)} seeds, got {wanted}")
     folder = out or OUT
-    done = run_experiment(names, chosen[0], wanted, folder, jobs, Console())
+    done = run_experiment(names, chosen, wanted, folder, jobs, Console())
     return 0 if done else 1
+
+
+def _chosen(scale: str) -> Scale:
+    for each in SCALES:
+        if each == scale:
+            return each
+    raise ConfigError(f"--scale: expected one of {', '.join(SCALES)}, got {scale!r}")

@@ -32,6 +32,9 @@ def experiment(
     out: Annotated[
         Path | None, typer.Option(help="Folder of all runs; default runs/experiments.")
     ] = None,
+    describe: Annotated[
+        bool, typer.Option("--describe", help="Run nothing; compare this scale with the full one.")
+    ] = False,
 ) -> None:
     """Run experiments in this process, without a router; run again, they go on.
 
@@ -40,6 +43,9 @@ def experiment(
     commands = import_installed("experiments.runs.commands", "experiments")
     if not names:
         typer.echo(commands.listing())
+        return
+    if describe:
+        typer.echo(commands.described(names, scale))
         return
     raise typer.Exit(commands.run(names, scale, seeds, seed, jobs, out))
 
