@@ -32,7 +32,7 @@ demo: $(VENV)/.all ## install what is needed, then run the demo until Ctrl-C
 
 # Four at a time: most tests that take long wait for something.
 test: check ## all checks and tests but the slow ones
-	$(PYTEST) -n 4 -m "not slow" tests
+	$(PYTEST) -n 4 --dist worksteal -m "not slow" tests
 
 test-full: check ## all checks and tests
 	$(PYTEST) -n 2 tests/unit tests/repository tests/contract
@@ -48,10 +48,10 @@ lint: $(VENV)/.dev ## style only
 	$(BIN)/mdformat --check README.md benchmarks/results.md $(filter-out docs/results.md,$(wildcard docs/*.md))
 
 unit: $(VENV)/.dev ## fast tests
-	$(PYTEST) -n 4 -m "not slow" tests/unit tests/repository tests/contract
+	$(PYTEST) -n 4 --dist worksteal -m "not slow" tests/unit tests/repository tests/contract
 
 system: $(VENV)/.dev ## tests with real processes and a real router, without the slow ones
-	$(PYTEST) -n 4 -m "not slow" tests/system tests/learning
+	$(PYTEST) -n 4 --dist worksteal -m "not slow" tests/system tests/learning
 
 mutants: $(VENV)/.dev ## break one guarantee after the other in a copy: do its tests fail? (minutes)
 	$(BIN)/python -m tests.mutate $(ARGS)
