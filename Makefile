@@ -16,6 +16,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 # Tests run beside each other: more than one thread each would only get in the way.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+BESIDE := -n 4 --dist loadscope --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test test-full check lint unit system mutants compose-test bench profile bench-full bench-peers clean
@@ -30,9 +31,9 @@ setup: $(VENV)/.dev ## make the virtual environment with everything in it
 demo: $(VENV)/.all ## install what is needed, then run the demo until Ctrl-C
 	@$(BIN)/corridor up --preset demo $(ARGS)
 
-# Four at a time: most tests that take long wait for something.
+# Four files at a time: most tests that take long wait for something.
 test: check ## all checks and tests but the slow ones
-	$(PYTEST) -n 4 --dist worksteal -m "not slow" tests
+	$(PYTEST) $(BESIDE) -m "not slow" tests
 
 test-full: check ## all checks and tests
 	$(PYTEST) -n 2 tests/unit tests/repository tests/contract
@@ -48,10 +49,10 @@ lint: $(VENV)/.dev ## style only
 	$(BIN)/mdformat --check README.md benchmarks/results.md $(filter-out docs/results.md,$(wildcard docs/*.md))
 
 unit: $(VENV)/.dev ## fast tests
-	$(PYTEST) -n 4 --dist worksteal -m "not slow" tests/unit tests/repository tests/contract
+	$(PYTEST) $(BESIDE) -m "not slow" tests/unit tests/repository tests/contract
 
 system: $(VENV)/.dev ## tests with real processes and a real router, without the slow ones
-	$(PYTEST) -n 4 --dist worksteal -m "not slow" tests/system tests/learning
+	$(PYTEST) $(BESIDE) -m "not slow" tests/system tests/learning
 
 mutants: $(VENV)/.dev ## break one guarantee after the other in a copy: do its tests fail? (minutes)
 	$(BIN)/python -m tests.mutate $(ARGS)

@@ -14,7 +14,7 @@ import pytest
 from benchmarks.waiting import wait_until
 from experiments.runs.schedule import shares_of
 
-pytestmark = pytest.mark.system
+pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
 
 DEMO = ("experiment", "demo", "--scale", "mini", "--seeds", "2", "--jobs", "2")
 

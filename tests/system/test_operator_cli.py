@@ -28,7 +28,7 @@ from shared.messages import (
 )
 from shared.settings import load
 
-pytestmark = pytest.mark.system
+pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
 
 
 @pytest.fixture

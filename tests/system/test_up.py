@@ -16,7 +16,7 @@ import pytest
 from benchmarks.waiting import wait_until
 from experiments.report.run_folder import read_run
 
-pytestmark = pytest.mark.system
+pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
 
 CORRIDOR = [sys.executable, "-m", "services.cli"]
 SMALL = (

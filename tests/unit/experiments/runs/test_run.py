@@ -15,6 +15,8 @@ from experiments.runs.schedule import Job, _distinct, chain, shares_of
 from shared import run_record
 from shared.errors import ConfigError, StateError
 
+pytestmark = pytest.mark.timeout(300)
+
 TEXT = """
 title = "t"
 source = "s"
