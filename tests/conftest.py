@@ -17,17 +17,6 @@ __all__ = ["wait_until"]
 _run_numbers = itertools.count()
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let the files whose tests may take longest begin: nobody waits for them at the end."""
-    longest_s: dict[str, float] = {}
-    for item in items:
-        mark = item.get_closest_marker("timeout")
-        allowed_s = float(mark.args[0]) if mark else 0.0
-        file = str(item.path)
-        longest_s[file] = max(longest_s.get(file, 0.0), allowed_s)
-    items.sort(key=lambda item: -longest_s[str(item.path)])
-
-
 @pytest.fixture(scope="session")
 def router() -> Iterator[str]:
     """Endpoint of a router that runs in a process of its own for the whole test session.
