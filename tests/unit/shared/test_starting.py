@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,7 +30,7 @@ def _signals_as_before() -> Iterator[None]:
 def test_sigterm_waits_until_the_service_can_answer_it() -> None:
     stop = StopFlag()
     with starting():
-        os.kill(os.getpid(), signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)
         assert not stop.is_set()
         answer_signals(stop)
         assert stop.is_set()
@@ -41,7 +40,7 @@ def test_sigterm_waits_until_the_service_can_answer_it() -> None:
 @pytest.mark.usefixtures("_signals_as_before")
 def test_what_an_earlier_start_held_back_is_forgotten() -> None:
     with starting():
-        os.kill(os.getpid(), signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)
     stop = StopFlag()
     with starting():
         answer_signals(stop)

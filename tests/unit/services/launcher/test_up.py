@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from collections.abc import Iterator
 
@@ -21,7 +20,7 @@ def _handlers_as_before() -> Iterator[None]:
 def test_a_closed_terminal_stops_a_run_and_handlers_are_put_back() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     with stop_on_signals() as stop:
-        os.kill(os.getpid(), signal.SIGHUP)
+        signal.raise_signal(signal.SIGHUP)
         assert stop.wait(5.0)
     assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
 
@@ -29,6 +28,6 @@ def test_a_closed_terminal_stops_a_run_and_handlers_are_put_back() -> None:
 def test_under_nohup_a_run_outlives_its_terminal() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     with stop_on_signals() as stop:
-        os.kill(os.getpid(), signal.SIGHUP)
+        signal.raise_signal(signal.SIGHUP)
         assert not stop.is_set()
     assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
