@@ -37,6 +37,10 @@ class Watch:
         assert self.newest is not None
         return self.newest
 
+    def wait_world(self, world: str) -> None:
+        """A heartbeat from before an answer may still be under way after it."""
+        wait_until(lambda: self.state().world == world, 30, f"the robot in {world}")
+
     def _beat(self) -> bool:
         self._inbox.wait(0.2)
         states = [state for _, state in self._inbox.take(ROBOT_STATE, RobotState)]
@@ -67,21 +71,21 @@ def test_commands_change_the_world_and_what_crosses_is_dropped_and_counted(
         assert corridor("obstacle", "remove", "corner").endswith(
             "no obstacles, 0 changes waiting\n"
         )
-        assert watch.state().world == "plus"
+        watch.wait_world("plus")
         # A switch right after a bump costs nothing, so it may take more than one.
         for world in ("minus", "plus") * 5:
             if not dropped():
                 assert f"world {world}" in corridor("world", "switch", world, "--start", "0")
-                assert watch.state().world == world
+                watch.wait_world(world)
                 learner = cluster.learner()
                 assert learner is not None
                 cluster.wait_episodes(learner.episode + 2, 60)
         cluster.wait(dropped, 10, "dropped samples are counted")
         corridor("world", "switch", "minus")
         corridor("obstacle", "place", "later", *IN_MINUS, "--at-episode", "1000000")
+        life = watch.state().life
         cluster.kill("driver")
         cluster.start("driver")
-        life = watch.state().life
         wait_until(lambda: watch.state().life != life, 30, "the new driver")
         assert (watch.state().world, watch.state().pending_changes) == ("minus", 1)
         told = " ".join(corridor("status").split())
@@ -122,7 +126,7 @@ def test_a_robot_in_real_time_goes_on_in_the_other_world(run_name: str, tmp_path
         first = next(look for look in looks if look.world == "minus")
         assert first.interruption == "world"
         assert first.attempt > 0
-        assert Watch(cluster).state().world == "minus"
+        Watch(cluster).wait_world("minus")
         cluster.stop_all()
 
 
