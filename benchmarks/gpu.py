@@ -37,6 +37,7 @@ from shared.rl.descriptor import block_sums, describe
 from shared.rl.learning import Trainer
 from shared.rl.memory import MIRROR, SampleStore
 from shared.rl.predictor import Predictor
+from shared.rl.schedule import Moment
 
 FITTED: dict[Mode, int] = {"check": 40, "short": 45_000, "full": 45_000}
 DESCRIBED: dict[Mode, int] = {"check": 40, "short": 90_000, "full": 90_000}
@@ -87,7 +88,7 @@ def fitting_phases(mode: Mode, device: Device) -> dict[str, Callable[[], object]
             for start in range(0, len(order), learning.batch_size):
                 naive(store, order[start : start + learning.batch_size])
 
-    return {"plain": plain_phase, "ours": lambda: list(trainer.learn(store, EPISODE))}
+    return {"plain": plain_phase, "ours": lambda: list(trainer.learn(store, Moment(EPISODE)))}
 
 
 def descriptions(mode: Mode, device: Device) -> dict[str, Callable[[], object]]:

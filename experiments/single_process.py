@@ -26,6 +26,7 @@ from shared.rl.learning import Trained, Trainer
 from shared.rl.memory import ReplayMemory
 from shared.rl.network import to_bytes
 from shared.rl.predictor import Predictor
+from shared.rl.schedule import Moment
 from shared.rl.turn import Maintenance, maintain, sample_rows
 
 
@@ -110,10 +111,11 @@ class SingleProcess:
             stored=commit.stored,
         )
         self.memory.append(rows, images)
-        maintenance = maintain(self.memory, commit.episode, config.memory, self.judging)
+        now = Moment(commit.episode, self.counters.actions, episode.actions)
+        maintenance = maintain(self.memory, now, config.memory, self.judging)
         if not commit.episode:  # the memory is being filled: not an episode, no training (E9)
             return TurnDone(commit, episode, maintenance, (), False)
-        trained = tuple(self.trainer.learn(self.memory, commit.episode))
+        trained = tuple(self.trainer.learn(self.memory, now))
         changed = self.trainer.apply_target_rule(commit.episode, episode.bump)
         if changed:
             self.publish()

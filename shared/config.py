@@ -280,6 +280,8 @@ class MemoryConfig(Section):
     discarded; 0: never (A44)."""
     equalise_every: int = Field(default=50, ge=0)
     """Episodes between reward equalisations; 0: never (A35)."""
+    equalise_every_actions: int = Field(default=0, ge=0)
+    """Actions between them, in place of `equalise_every`; 0: episodes are counted (E39)."""
     equalise_keep: Probability = 0.7
     """Eq 3.5: r <- keep r + (1 - keep) Q."""
     protect_terminal: bool = False
@@ -316,6 +318,8 @@ class LearningConfig(Section):
     """E30."""
     fit_every: int = Field(default=100, ge=0)
     """Episodes between fitting phases; 0: never."""
+    fit_every_actions: int = Field(default=0, ge=0)
+    """Actions between them, in place of `fit_every`; 0: episodes are counted (E39)."""
     fit_epochs: int = Field(default=3, ge=1, le=1000)
     augmentation: Literal["none", "mirror"] = "none"
     """mirror: half of all samples, by chance, are mirrored for training, left and right

@@ -429,6 +429,9 @@ class Turn(Message):
     change: Count
     bump: bool
     actions: Count
+    """Actions of this episode."""
+    total_actions: Count
+    """Actions of counted episodes until then, those of this one included."""
     samples: Count
 
 

@@ -126,11 +126,9 @@ class RunInfo(_Record):
     source: str = ""
     """Where the thesis describes it."""
     scale: str
-    """`full` or `mini`; `services` for a run of the services."""
+    """Name of the scale of an experiment; `services` for a run of the services."""
     factor: float = Field(default=1.0, gt=0.0)
-    """How many times fewer episodes than in the thesis; 1 at full scale."""
-    memory_factor: float = Field(default=1.0, gt=0.0)
-    """How many times smaller memories are."""
+    """How many times smaller than in the thesis memories and numbers of actions are."""
     seed: int
     after: str = ""
     """The experiment whose end this one began with; empty for none."""

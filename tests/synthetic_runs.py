@@ -73,7 +73,7 @@ def write_run(out: Path, experiment: str, seed: int, **changes: Any) -> Path:
     """
     shape = SHAPES.get(experiment, VARIANT)
     draw = np.random.default_rng([seed, *experiment.encode()])
-    folder = out / f"{experiment}-mini" / f"seed-{seed}"
+    folder = out / f"{experiment}-tenth" / f"seed-{seed}"
     folder.mkdir(parents=True)
     episodes = _episodes(shape, draw)
     write_csv(folder / "episodes.csv", EPISODE_COLUMNS, episodes)
@@ -205,7 +205,7 @@ def _info(experiment: str, shape: Shape, seed: int, episodes: list[Row]) -> dict
         first += count
     return {
         "experiment": experiment, "title": experiment.replace("-", " ").capitalize(),
-        "scale": "mini", "factor": FACTOR, "memory_factor": FACTOR, "seed": seed,
+        "scale": "tenth", "factor": FACTOR, "seed": seed,
         "command": f"experiment {experiment} --seed {seed}", "commit": "0123abc",
         "machine": "2 cores, AMD EPYC", "python": "3.11.9", "torch": "2.13.0",
         "started": "2026-01-01T00:00:00Z", "finished": "2026-01-01T01:00:00Z",

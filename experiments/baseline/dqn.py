@@ -37,7 +37,8 @@ from gymnasium.wrappers import TimeLimit
 from experiments.drives.choosers import Chooser
 from experiments.drives.frozen_drives import evaluate
 from experiments.environment import CorridorEnv, Image
-from experiments.plans.plan import SCALES, Scale, load_plan, stage_config
+from experiments.plans.plan import stage_config
+from experiments.plans.scales import SCALES, divisor_of, load_plan
 from experiments.records import EVALUATION_COLUMNS
 from services.robot_driver.simulated.world import WorldError
 from shared.config import Config
@@ -80,9 +81,8 @@ class BaselinePlan:
     """A run of the baseline, as the command line asks for it."""
 
     config: Config
-    scale: Scale
+    scale: str
     factor: int
-    memory_factor: int
     actions: int
     reward: str
     starts: int
@@ -203,7 +203,6 @@ def _told(plan: BaselinePlan, learner: Learner, seconds: float, began: str) -> b
         title=f"DQN of Stable-Baselines3, reward {plan.reward}",
         scale=plan.scale,
         factor=plan.factor,
-        memory_factor=plan.memory_factor,
         seed=plan.config.run.seed,
         command=plan.command,
         **made_here(),
@@ -239,7 +238,7 @@ def planned(words: Sequence[str]) -> BaselinePlan:
         prog="python -m experiments.baseline.dqn", description=(__doc__ or "").split("\n")[0]
     )
     parser.add_argument("--like", default="plus-rmm", help="plan: world, network and memory")
-    parser.add_argument("--scale", choices=SCALES, default="mini", help="of the plan")
+    parser.add_argument("--scale", choices=SCALES, default="tenth", help="of the plan")
     parser.add_argument("--actions", type=_positive, default=50_000, help="after the random ones")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--reward", choices=REWARDS, default=REWARDS[0])
@@ -265,9 +264,8 @@ def planned(words: Sequence[str]) -> BaselinePlan:
     if "--out" in told:
         del told[told.index("--out") : told.index("--out") + 2]
     command = shlex.join(["python", "-m", "experiments.baseline.dqn", *told])
-    factors = (like.mini.factor, like.mini.memories_by) if given.scale == "mini" else (1, 1)
     return BaselinePlan(
-        config, given.scale, *factors, given.actions,
+        config, given.scale, divisor_of(like, given.scale), given.actions,
         given.reward, given.starts, given.drive_actions, given.out, command,
     )  # fmt: skip
 

@@ -2,9 +2,8 @@
 
 A plan is a TOML file in `plans/`: a configuration (differences to the defaults only), stages that
 change parts of it while the run goes on, the plan whose end it begins with, and how reports show
-it. `full` has the exact constants, computed on a GPU where there is one; `mini` has the same shape,
-with episodes and memories divided by the plan's factors (the counts of the memory follow, E17b), a
-narrower network, and arithmetic that suits it.
+it. `full` has the exact constants, computed on a GPU where there is one. What smaller scales make
+of a plan is the business of `scales`.
 """
 
 from __future__ import annotations
@@ -22,26 +21,10 @@ from shared.config import Config, Name, PolicyConfig, Section
 from shared.errors import ConfigError
 from shared.settings import preset_tree
 
-Scale = Literal["full", "mini"]
-SCALES: tuple[Scale, ...] = ("full", "mini")
 Tree = dict[str, Any]
 PLANS: Traversable = resources.files("experiments").joinpath("plans")
 """The folder of all plans."""
-SIZES = (("memory", "capacity"), ("memory", "capacity_max"), ("memory", "capacity_step"))
-"""What a smaller scale divides by its `memory_factor`."""
-PERIODS = (("memory", "equalise_every"), ("learning", "fit_every"))
-"""What it divides by its `factor`: periods counted in episodes."""
-MINI: Tree = {
-    "network": {"filters": 16, "layout": "cpcccp"},
-    "numerics": {
-        # Equalising passes all samples through the network every other episode.
-        "replay": {"engine": "auto", "precision": "auto"},
-        # A narrow network takes a third less time a step in parts of this size; bfloat16 would
-        # gain little more, and not on every processor.
-        "learner": {"precision": "float32", "batch": 16},
-    },
-}
-"""What every plan has at mini scale; a plan's own `mini.config` comes on top."""
+Unit = Literal["episodes", "actions"]
 
 
 class Stage(Section):
@@ -49,33 +32,14 @@ class Stage(Section):
 
     name: Name
     until: Annotated[int, Field(ge=1)]
-    """Last episode of the stage, counted from the first one of the plan."""
+    """Where it ends: episodes or actions (`counted_in`) since the plan began."""
     config: Tree = Field(default_factory=dict)
     """What changes as the stage begins; later stages keep it."""
     force_candidates: bool = False
     """Mark all samples stored so far by decree as the stage begins (A44)."""
     changes: Annotated[tuple[Tree, ...], Field(strict=False)] = ()
-    """Worlds and obstacles that change on the way: fields of `WorldChange`, `at_episode` counted
-    from the plan's first episode."""
-
-
-class Mini(Section):
-    """How the small scale differs."""
-
-    factor: Annotated[int, Field(ge=1, le=1000)]
-    """Episodes, and periods in episodes, are divided by it."""
-    memory_factor: Annotated[int, Field(ge=0, le=1000)] = 0
-    """Memories are divided by it; 0: by `factor`. An episode is as long as ever, so a memory that
-    shrinks as much as the number of episodes holds the last few of them only."""
-    mini_batches: Annotated[int, Field(ge=1, le=100)] = 1
-    """Mini-batches after an episode are multiplied by it: a network needs its training steps,
-    however small the memory."""
-    config: Tree = Field(default_factory=dict)
-
-    @property
-    def memories_by(self) -> int:
-        """What memories are divided by."""
-        return self.memory_factor or self.factor
+    """Worlds and obstacles that change on the way: fields of `WorldChange`, but `at` in place of
+    `at_episode`: episodes or actions since the plan began, at which the change is there."""
 
 
 class Evaluation(Section):
@@ -106,6 +70,15 @@ class Plan(Section):
     """The plan whose end this one begins with: weights, optimiser, memory, robot (A46)."""
     preset: str = ""
     """A preset that `config` differs from; empty: the defaults."""
+    counted_in: Unit = "episodes"
+    """What stages and changes count. Smaller scales count actions (E39)."""
+    episode_actions: Annotated[float, Field(ge=0.0)] = 0.0
+    """Mean length of an episode, for scales that count actions; 0: that of `thesis`."""
+    fixed_size: bool = False
+    """Whether smaller scales leave it as it is, but for the width of the network: a plan whose
+    memory is small already."""
+    small: Tree = Field(default_factory=dict)
+    """Settings that differ at smaller scales."""
     thesis: dict[str, float] = Field(default_factory=dict)
     """Figures of the thesis, to stand beside ours."""
     report: Presentation = Presentation()
@@ -119,7 +92,6 @@ class Plan(Section):
     seeds: Annotated[tuple[int, ...], Field(min_length=1, strict=False)] = (1, 2, 3, 4, 5)
     """Seeds, fixed before any run. A comparison takes the first ones."""
     evaluation: Evaluation = Evaluation()
-    mini: Mini
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -131,6 +103,8 @@ class Plan(Section):
         names = [stage.name for stage in self.stages]
         if len(set(names)) < len(names):
             raise ValueError(f"stages: names must differ, got {names}")
+        if any("at" not in change for stage in self.stages for change in stage.changes):
+            raise ValueError("stages: expected `at` in every change")
         return self
 
 
@@ -140,13 +114,13 @@ def plan_names(folder: Traversable = PLANS) -> list[str]:
     return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
 
 
-def load_plan(name: str, scale: Scale, folder: Traversable = PLANS) -> Plan:
-    """The plan of this name at a scale.
+def full_plan(name: str, folder: Traversable = PLANS) -> Plan:
+    """The plan of this name, as its file says it.
 
     Raises:
         ConfigError: There is none of that name, or its file is wrong.
     """
-    return read_plan(name, _text_of(name, folder), scale, folder)
+    return read_plan(name, _text_of(name, folder), folder)
 
 
 def presentations(names: Iterable[str], folder: Traversable = PLANS) -> dict[str, Presentation]:
@@ -157,12 +131,11 @@ def presentations(names: Iterable[str], folder: Traversable = PLANS) -> dict[str
     """
     known = plan_names(folder)
     return {
-        name: load_plan(name, "full", folder).report if name in known else Presentation()
-        for name in names
+        name: full_plan(name, folder).report if name in known else Presentation() for name in names
     }
 
 
-def read_plan(name: str, text: str, scale: Scale, folder: Traversable = PLANS) -> Plan:
+def read_plan(name: str, text: str, folder: Traversable = PLANS) -> Plan:
     """The plan in the text of a file; `folder` has the plans it may be `like`.
 
     Raises:
@@ -174,40 +147,14 @@ def read_plan(name: str, text: str, scale: Scale, folder: Traversable = PLANS) -
         raise ConfigError(_one_line(f"plan {name}", error)) from error
     if plan.preset:
         plan = plan.model_copy(update={"config": merged(preset_tree(plan.preset), plan.config)})
-    plan = scaled(plan) if scale == "mini" else unscaled(plan)
-    for index in range(max(1, len(plan.stages))):
-        stage_config(plan, index, seed=1)
+    check(plan)
     return plan
 
 
-def unscaled(plan: Plan) -> Plan:
-    """The plan at full scale: it computes as the demo does, measured where it runs."""
-    numerics = {"numerics": preset_tree("demo")["numerics"]}
-    return plan.model_copy(update={"config": merged(numerics, plan.config)})
-
-
-def scaled(plan: Plan) -> Plan:
-    """The plan at mini scale."""
-    mini = plan.mini
-    stages = tuple(
-        stage.model_copy(
-            update={
-                "until": max(1, stage.until // mini.factor),
-                "config": _divided(stage.config, mini),
-                "changes": tuple(_earlier(change, mini.factor) for change in stage.changes),
-            }
-        )
-        for stage in plan.stages
-    )
-    every = max(1, plan.evaluation.every_actions // mini.factor)
-    divided = _divided(_with_defaults(plan.config), mini)
-    return plan.model_copy(
-        update={
-            "stages": stages,
-            "config": merged(merged(divided, MINI), mini.config),
-            "evaluation": plan.evaluation.model_copy(update={"every_actions": every}),
-        }
-    )
+def check(plan: Plan) -> None:
+    """Raise ConfigError where the configuration of a stage is wrong."""
+    for index in range(max(1, len(plan.stages))):
+        stage_config(plan, index, seed=1)
 
 
 def stage_config(plan: Plan, index: int, seed: int) -> Config:
@@ -258,39 +205,12 @@ def _tree(names: tuple[str, ...], text: str, folder: Traversable) -> Tree:
     if like in names:
         raise ConfigError(f"plan {names[0]}: like: {like} is like itself")
     below = _tree((*names, like), _text_of(like, folder), folder)
-    below.pop("thesis", None)  # figures of another experiment
+    thesis = below.pop("thesis", {})  # figures of another experiment, of which one stays
+    if "actions" in thesis:
+        below.setdefault("episode_actions", thesis["actions"] / thesis["episodes"])
     report = below.get("report", {})
     below["report"] = {key: report[key] for key in INHERITED if key in report}
     return merged(below, tree)
-
-
-def _with_defaults(config: Tree) -> Tree:
-    """Add the values that a smaller scale divides where the plan leaves them at the default."""
-    defaults = Config().to_dict()
-    tables: Tree = {"learning": {}, "memory": {}}
-    for section, key in (*SIZES, *PERIODS, ("learning", "mini_batches_per_episode")):
-        if key in defaults[section]:
-            tables[section][key] = defaults[section][key]
-    return merged(tables, config)
-
-
-def _divided(config: Tree, mini: Mini) -> Tree:
-    result = merged({}, config)
-    by = dict.fromkeys(SIZES, mini.memories_by)
-    by |= dict.fromkeys(PERIODS, mini.factor)
-    for (section, key), factor in by.items():
-        if result.get(section, {}).get(key, 0) > 0:
-            value = max(1, result[section][key] // factor)
-            result = merged(result, {section: {key: value}})
-    batches = result.get("learning", {}).get("mini_batches_per_episode")
-    if batches:
-        more = {"learning": {"mini_batches_per_episode": batches * mini.mini_batches}}
-        result = merged(result, more)
-    return result
-
-
-def _earlier(change: Tree, factor: int) -> Tree:
-    return {**change, "at_episode": max(1, int(change.get("at_episode", 1)) // factor)}
 
 
 def _one_line(where: str, error: ValidationError) -> str:

@@ -8,9 +8,9 @@ from importlib.resources.abc import Traversable
 
 import numpy as np
 
-from experiments.plans.plan import PLANS, Plan, load_plan, plan_names, stage_config
+from experiments.plans.plan import PLANS, Plan, plan_names, stage_config
+from experiments.plans.scales import episode_actions, load_plan
 from experiments.report.document import Block, Missing, Table
-from experiments.report.measures import of_seeds
 from experiments.report.run_folder import Experiment, RunFolder
 
 TITLE = "Cost of the full scale, a seed each"
@@ -71,7 +71,7 @@ def full_scale(
 
     Args:
         experiments: At any scale. Actions are those of full runs, else those that the thesis
-            gives, else those of mini runs times the plan's factor.
+            gives, else as many as the plan's mean episode makes.
         gpu_step_ms: Measured time of a gradient step on a GPU; adds a column of projected hours.
         plans: The folder of plans.
     """
@@ -87,7 +87,7 @@ def full_scale(
         projections.append(Rates(found.action_s, gpu_step_ms / 1000.0))
     every = [load_plan(name, "full", plans) for name in plan_names(plans)]
     rows = tuple(
-        _row(plan, named.get(("full", plan.name)), named.get(("mini", plan.name)), projections)
+        _row(plan, named.get(("full", plan.name)), projections)
         for plan in every
         if plan.stages and plan.report.full_scale
     )
@@ -95,10 +95,8 @@ def full_scale(
     return Table("full-scale", f"{TITLE}: {each}", tuple(header), rows)
 
 
-def _row(
-    plan: Plan, full: Experiment | None, mini: Experiment | None, projections: Sequence[Rates]
-) -> tuple[str, ...]:
-    actions, source = _actions(plan, full, mini)
+def _row(plan: Plan, full: Experiment | None, projections: Sequence[Rates]) -> tuple[str, ...]:
+    actions, source = _actions(plan, full)
     steps = gradient_steps(plan)
     done = [run.info.seconds for run in full.runs if run.info.complete] if full else []
     hours = (f"{rates.hours(actions, steps):.1f}" if source else "-" for rates in projections)
@@ -112,14 +110,13 @@ def _row(
     )
 
 
-def _actions(plan: Plan, full: Experiment | None, mini: Experiment | None) -> tuple[float, str]:
+def _actions(plan: Plan, full: Experiment | None) -> tuple[float, str]:
     """How many to reckon with, and where the number comes from; empty: from nowhere."""
     complete = [run for run in full.runs if run.info.complete] if full else []
     if complete:
         return float(np.median([run.actions for run in complete])), "our runs, full"
     if told := plan.thesis.get("actions"):
         return told, "thesis"
-    if mini is not None:
-        counts = of_seeds(mini, lambda run: float(run.actions))
-        return float(np.median(counts)) * plan.mini.factor, f"our runs, mini × {plan.mini.factor}"
+    if length := episode_actions(plan):
+        return length * plan.stages[-1].until, f"episodes of {length:.0f} actions"
     return 0.0, ""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -26,13 +25,12 @@ class Measure:
 
     text: str
     of: Callable[[RunFolder], float]
-    scales: Literal["", "episodes", "memory"] = ""
-    """What it grows with: the number of episodes, or the size of the memory."""
+    grows: bool = False
+    """Whether it grows with the scale."""
 
     def scaled(self, value: float, info: RunInfo) -> float:
         """A number of the thesis at the scale of a run."""
-        by = {"": 1.0, "episodes": info.factor, "memory": info.memory_factor}
-        return value / by[self.scales]
+        return value / info.factor if self.grows else value
 
 
 def _highest(run: RunFolder, column: str) -> float:
@@ -62,15 +60,15 @@ def actions_per_episode(run: RunFolder) -> float:
 
 
 MEASURED = {
-    "episodes": Measure("episodes", lambda run: float(len(run.episodes)), "episodes"),
-    "actions": Measure("actions", lambda run: float(run.actions), "episodes"),
+    "episodes": Measure("episodes", lambda run: float(len(run.episodes)), grows=True),
+    "actions": Measure("actions", lambda run: float(run.actions), grows=True),
     "actions_per_episode": Measure("actions per episode", actions_per_episode),
     "capacity": Measure(
-        "largest capacity of the memory", lambda run: _highest(run, "capacity"), "memory"
+        "largest capacity of the memory", lambda run: _highest(run, "capacity"), grows=True
     ),
-    "longest_run": Measure("most actions without a bump", longest_run, "episodes"),
+    "longest_run": Measure("most actions without a bump", longest_run, grows=True),
     "longest_run_episode": Measure(
-        "episode of the longest way without a bump", longest_run_episode, "episodes"
+        "episode of the longest way without a bump", longest_run_episode, grows=True
     ),
     "fitness": Measure("highest mean fitness", max_mean_fitness),
     "max_threshold_percent": Measure(

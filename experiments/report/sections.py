@@ -68,7 +68,7 @@ def _beside_thesis(experiment: Experiment) -> list[Block]:
             continue
         scaled = number(measure.scaled(value, first))
         rows.append((measure.text, number(value), scaled, spread(of_seeds(experiment, measure.of))))
-    scale = f"thesis at this scale (episodes 1/{first.factor:g}, memory 1/{first.memory_factor:g})"
+    scale = f"thesis at this scale (1/{first.factor:g})"
     header = ("", "thesis", scale, "ours")
     title = "Beside the thesis, whose numbers are those of single runs: shapes count, not digits"
     return [Table(f"{experiment.full_name}-thesis", title, header, tuple(rows))]

@@ -15,7 +15,8 @@ from typing import Any, get_args
 
 import numpy as np
 
-from experiments.plans.plan import Plan, Scale, stage_config
+from experiments.plans.plan import Plan, Unit, stage_config
+from experiments.plans.scales import divisor_of
 from experiments.records import EVALUATION_COLUMNS
 from experiments.runs import snapshot, stages
 from experiments.runs.episode_row import episode_row, held, memory_hash
@@ -53,9 +54,9 @@ class Progress:
     """How far a run is."""
 
     run: str
-    episode: int
-    episodes: int
-    actions: int
+    done: int
+    of: int
+    unit: Unit
     fitness: float
     """Mean over the last episodes."""
 
@@ -79,14 +80,14 @@ class Run:
     def __init__(
         self,
         plan: Plan,
-        scale: Scale,
+        scale: str,
         seed: int,
         folder: Path,
         predecessor: Path | None,
         command: str,
     ) -> None:
         self.plan, self.folder, self.seed = plan, folder, seed
-        self._scale: Scale = scale
+        self._scale = scale
         self._command, self._started = command, now_utc()
         first = claim(folder, stage_config(plan, 0, seed))
         common = folder.parents[1] / "machines" / machine_key(first)
@@ -96,8 +97,6 @@ class Run:
         robot = SimRobot(config.robot, load_world(config.robot.world), seed)
         self._loop = SingleProcess(config, robot)
         self._totals = Totals()
-        self._stage = 0
-        self._offset = 0
         self._driving = self._best = b""
         self._observer = Observer(plan, folder, config)
         self._fitness: list[int] = []
@@ -106,7 +105,7 @@ class Run:
     @property
     def _stage_name(self) -> str:
         """Name of the stage that runs, or ran last. It is empty for a plan without stages."""
-        index = min(self._stage, len(self.plan.stages) - 1)
+        index = min(self._totals.stage, len(self.plan.stages) - 1)
         return self.plan.stages[index].name if self.plan.stages else ""
 
     @property
@@ -160,18 +159,19 @@ class Run:
             yield done
 
     def _begin_stage(self) -> None:
-        stage, config = self.plan.stages[self._stage], self._config(self._stage)
+        stage, config = self.plan.stages[self._totals.stage], self._config(self._totals.stage)
         first = not self._totals.stages
-        stages.enter(self._loop, self.plan, stage, config, self._offset, first=first)
+        stages.enter(self._loop, self.plan, stage, config, first=first)
         self._totals.begin_stage(stage.name, config.robot.world, self._loop)
+        stages.change_world(self._loop, self.plan, stage, self._totals)
 
     def _advance(self, done: TurnDone) -> bool:
         """Evaluate and go on to the next stage where due; whether the plan is at its end."""
-        stage = self.plan.stages[self._stage]
+        stage = self.plan.stages[self._totals.stage]
         counters = self._loop.counters
         if not done.commit.episode:
             return False
-        over = counters.episode - self._offset >= stage.until
+        over = self._totals.done(self._loop, self.plan.counted_in) >= stage.until
         every = self.plan.evaluation.every_actions
         due = counters.actions // every > max(self._totals.evaluated_at, 0) // every
         if self._totals.evaluated_at < 0 or due or over:
@@ -179,12 +179,13 @@ class Run:
             self._show()
             self._observer.evaluate(self._world, self._now(), over=over)
         if not over:
+            stages.change_world(self._loop, self.plan, stage, self._totals)
             return False
         self._totals.end_stage(self._loop)
         self._show()
         self._observer.take_pictures(stage.name, self._world)
-        self._stage += 1
-        if self._stage == len(self.plan.stages):
+        self._totals.stage += 1
+        if self._totals.stage == len(self.plan.stages):
             return True
         self._begin_stage()
         return False
@@ -253,15 +254,13 @@ class Run:
 
     def _write_run(self, *, complete: bool) -> None:
         counters, plan, totals = self._loop.counters, self.plan, self._totals
-        mini = plan.mini if self._scale == "mini" else None
-        episodes = counters.episode - self._offset
+        episodes = counters.episode - totals.episodes_before
         info = RunInfo(
             experiment=plan.name,
             title=plan.title,
             source=plan.source,
             scale=self._scale,
-            factor=mini.factor if mini else 1,
-            memory_factor=mini.memories_by if mini else 1,
+            factor=divisor_of(plan, self._scale),
             seed=self.seed,
             after=plan.after,
             command=self._command,
@@ -290,8 +289,6 @@ class Run:
     def _extra(self) -> dict[str, Any]:
         return {
             "totals": asdict(self._totals),
-            "stage": self._stage,
-            "offset": self._offset,
             "best": self._best,
             "fitness": self._fitness,
             "started": self._started,
@@ -315,7 +312,8 @@ class Run:
                     f"not been run to its end there: run it first"
                 )
             snapshot.restore(end, self._loop)
-            self._offset = self._loop.counters.episode
+            self._totals.episodes_before = self._loop.counters.episode
+            self._totals.actions_before = self._loop.counters.actions
         self._driving = to_bytes(self._loop.trainer.target_network)
         self._best = self._best or self._driving  # until an episode of this run was driven
         if not self.complete:
@@ -323,12 +321,11 @@ class Run:
 
     def _take_up(self, extra: dict[str, Any]) -> None:
         self._totals = Totals(**extra["totals"])
-        self._stage, self._offset = int(extra["stage"]), int(extra["offset"])
         self._best = extra["best"]
         self._fitness = list(extra["fitness"])
         self._started = str(extra["started"])
-        if self._stage < len(self.plan.stages):
-            self._loop.reconfigure(self._config(self._stage))
+        if self._totals.stage < len(self.plan.stages):
+            self._loop.reconfigure(self._config(self._totals.stage))
 
     def _drop_unsaved(self) -> None:
         """Delete rows that were written after the snapshot: they will be written again."""
@@ -339,11 +336,10 @@ class Run:
             write_csv(path, columns, rows)
 
     def _progress(self) -> Progress:
-        episode = self._loop.counters.episode - self._offset
         return Progress(
             run=f"{self.plan.name} {self.seed}",
-            episode=episode,
-            episodes=self.plan.stages[-1].until if self.plan.stages else 0,
-            actions=self._all_actions,
+            done=self._totals.done(self._loop, self.plan.counted_in),
+            of=self.plan.stages[-1].until if self.plan.stages else 0,
+            unit=self.plan.counted_in,
             fitness=float(np.mean(self._fitness)) if self._fitness else 0.0,
         )

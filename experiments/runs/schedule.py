@@ -1,6 +1,6 @@
 """Many runs of a plan: seeds side by side, predecessors first, progress in the terminal.
 
-`corridor experiment NAME --scale mini --seeds 3` runs a plan with its first three seeds, two at a
+`corridor experiment NAME --scale tenth --seeds 3` runs a plan with its first three seeds, two at a
 time on two cores. Run again, it goes on where it was stopped; finished runs are left alone.
 """
 
@@ -22,7 +22,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
 
-from experiments.plans.plan import Plan, Scale, load_plan
+from experiments.plans.plan import Plan
+from experiments.plans.scales import load_plan
 from experiments.runs.run import Progress, Run
 from shared.errors import CorridorError
 
@@ -37,7 +38,7 @@ class Job:
     """One run to be done."""
 
     plan: str
-    scale: Scale
+    scale: str
     seed: int
     out: Path
 
@@ -52,7 +53,7 @@ class Job:
         return f"{self.plan} {self.seed}"
 
 
-def chain(name: str, scale: Scale) -> list[Plan]:
+def chain(name: str, scale: str) -> list[Plan]:
     """A plan and those it goes on from, the first one first (A46). Raises ConfigError."""
     plan = load_plan(name, scale)
     return [*chain(plan.after, scale), plan] if plan.after else [plan]
@@ -60,7 +61,7 @@ def chain(name: str, scale: Scale) -> list[Plan]:
 
 def run_experiment(
     names: Sequence[str],
-    scale: Scale,
+    scale: str,
     seeds: Sequence[int] | int,
     out: Path,
     jobs: int,
@@ -70,7 +71,7 @@ def run_experiment(
 
     Args:
         names: Names of plans.
-        scale: `full` or `mini`.
+        scale: Name of a scale.
         seeds: The seeds, or how many of each plan's own seeds, from the first on.
         out: Folder for all runs.
         jobs: Runs side by side; they divide the cores among them.
@@ -114,7 +115,7 @@ def _queue_of(context: SpawnContext, items: Iterable[object]) -> Any:
 
 
 def _pieces(
-    names: Sequence[str], scale: Scale, seeds: Sequence[int] | int, out: Path
+    names: Sequence[str], scale: str, seeds: Sequence[int] | int, out: Path
 ) -> list[list[Job]]:
     """The jobs of an experiment as pieces of work. Raises ConfigError."""
     chains = [chain(name, scale) for name in names]
@@ -155,7 +156,7 @@ def _bars(console: Console) -> Bars:
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("episodes, {task.fields[text]}"),
+        TextColumn("{task.fields[text]}"),
         TimeRemainingColumn(),
         console=console,
     )
@@ -172,9 +173,9 @@ def _watch(futures: list[Future[bool]], reports: Any, bars: Bars) -> None:
                 return
             continue
         if progress.run not in tasks:
-            tasks[progress.run] = bars.add_task(progress.run, total=progress.episodes, text="")
-        text = f"{progress.actions} actions, fitness {progress.fitness:.0f}"
-        bars.update(tasks[progress.run], completed=progress.episode, text=text)
+            tasks[progress.run] = bars.add_task(progress.run, total=progress.of, text="")
+        text = f"{progress.unit}, fitness {progress.fitness:.0f}"
+        bars.update(tasks[progress.run], completed=progress.done, text=text)
 
 
 def _failed(futures: list[Future[bool]]) -> bool:

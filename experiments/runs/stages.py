@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from experiments.plans.plan import Plan, Stage, merged
+from experiments.runs.totals import Totals
 from experiments.single_process import SingleProcess
 from shared.config import Config
 from shared.errors import ConfigError
@@ -11,9 +12,7 @@ from shared.rl.retention.rmm import force_candidates
 from shared.rl.retention.strategy import begin
 
 
-def enter(
-    loop: SingleProcess, plan: Plan, stage: Stage, config: Config, offset: int, *, first: bool
-) -> None:
+def enter(loop: SingleProcess, plan: Plan, stage: Stage, config: Config, *, first: bool) -> None:
     """Let the loop go on in a stage.
 
     Args:
@@ -21,7 +20,6 @@ def enter(
         plan: Plan of the run.
         stage: The stage.
         config: Configuration of the stage.
-        offset: Episodes before this run.
         first: Whether the run begins with this stage.
 
     Raises:
@@ -33,9 +31,6 @@ def enter(
         episode = loop.counters.episode
         switch = WorldChange(kind="switch", world=config.robot.world, at_episode=episode)
         _change(loop, plan, switch)
-    for change in stage.changes:
-        at = offset + int(change["at_episode"])
-        _change(loop, plan, WorldChange.model_validate({**change, "at_episode": at}))
     if stage.force_candidates:
         force_candidates(loop.memory, loop.memory.ids)
     # Both change on the way: a stage sets them where it says something new.
@@ -50,8 +45,24 @@ def enter(
         loop.memory.set_capacity(config.memory.capacity)
 
 
+def change_world(loop: SingleProcess, plan: Plan, stage: Stage, totals: Totals) -> None:
+    """Tell the driver of the changes that are due in the next episode.
+
+    Raises:
+        ConfigError: The driver refuses one.
+    """
+    following = totals.done(loop, plan.counted_in) + 1
+    for change in stage.changes[totals.changes :]:
+        if change["at"] > following:
+            break
+        wish = {key: value for key, value in change.items() if key != "at"}
+        wish["at_episode"] = loop.counters.episode + 1
+        _change(loop, plan, WorldChange.model_validate(wish))
+        totals.changes += 1
+
+
 def _change(loop: SingleProcess, plan: Plan, wish: WorldChange) -> None:
-    """Raises ConfigError when the driver refuses."""
+    """Let the driver change the world. Raises ConfigError when it refuses."""
     answer = loop.env.driver.change(wish)
     if not answer.accepted:
         raise ConfigError(f"plan {plan.name}: {wish.kind}: {answer.reason}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from experiments.plans.plan import Unit
 from experiments.single_process import SingleProcess, TurnDone
 from services.replay.numbering import bump_free
 
@@ -28,6 +29,13 @@ class Totals:
     one_action_episodes: int = 0
     """Counted episodes of this run that lasted a single action (E11)."""
     stages: list[dict[str, Any]] = field(default_factory=list)
+    stage: int = 0
+    """Which stage of the plan goes on; their number at the end."""
+    changes: int = 0
+    """Changes of the world in this stage that the driver has been told of."""
+    episodes_before: int = 0
+    """Counted episodes before the plan began."""
+    actions_before: int = 0
 
     def count(self, done: TurnDone) -> bool:
         """Count a turn; whether a counted episode made the longest run without a bump longer."""
@@ -39,8 +47,15 @@ class Totals:
         self.longest_run = max(length, self.longest_run)
         return longer
 
+    def done(self, loop: SingleProcess, unit: Unit) -> int:
+        """Episodes or actions since the plan began."""
+        if unit == "episodes":
+            return loop.counters.episode - self.episodes_before
+        return loop.counters.actions - self.actions_before
+
     def begin_stage(self, name: str, world: str, loop: SingleProcess) -> None:
         """Note where a stage begins."""
+        self.changes = 0
         self.stages.append(
             {
                 "name": name,

@@ -22,8 +22,12 @@ def experiment(
         typer.Argument(metavar="[NAME]...", help="Plans, such as plus-rmm; none: list them."),
     ] = None,
     scale: Annotated[
-        str, typer.Option(help="full: the thesis's constants; mini: minutes instead of days.")
-    ] = "mini",
+        str,
+        typer.Option(
+            help="full: the thesis's constants; fifth, tenth: smaller, with a narrow network; "
+            "fifth-wide, tenth-wide: with the full one."
+        ),
+    ] = "tenth",
     seeds: Annotated[
         int, typer.Option(min=1, help="How many of the plan's seeds, from the first.")
     ] = 1,

@@ -19,6 +19,7 @@ from shared.metrics import MetricsLog
 from shared.numerics import settle
 from shared.rl.learning import Trained, Trainer
 from shared.rl.network import to_bytes, weights_hash
+from shared.rl.schedule import Moment
 from shared.run_record import TRAINING, TRAINING_COLUMNS
 from shared.service import TICK_S, Service, Stopped, service
 from shared.weights import parts
@@ -138,7 +139,8 @@ class LearnerLoop:
         """
         losses = []
         try:
-            for trained in self._trainer.learn(self._mirror.samples, turn.episode):
+            now = Moment(turn.episode, turn.total_actions, turn.actions)
+            for trained in self._trainer.learn(self._mirror.samples, now):
                 if trained.loss is not None:
                     losses.append(trained.loss)
                 self._trained = trained

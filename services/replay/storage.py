@@ -173,8 +173,8 @@ class Storage:
                 turn, turn_change = commit.episode, number
                 entry = {
                     "change": number,
-                    "bump": bool(summary["bump"]),
-                    "actions": int(summary["actions"]),
+                    **{name: summary[name] for name in ("bump", "actions")},
+                    "total_actions": summary["totals"]["actions"],
                     "samples": commit.stored,
                 }
                 txn.put(key_of(turn), pack(entry), db=self._tables.db["turns"])

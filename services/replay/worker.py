@@ -25,6 +25,7 @@ from shared.numerics import settle
 from shared.rl.memory import ReplayMemory
 from shared.rl.predictor import Predictor
 from shared.rl.retention.strategy import strategy
+from shared.rl.schedule import Moment
 from shared.rl.turn import Maintenance, maintain
 from shared.run_record import EPISODES, REPLAY_COLUMNS, STAGE, turn_columns
 from shared.service import TICK_S, Service, Stopped
@@ -111,7 +112,7 @@ class TurnWorker(threading.Thread):
         memory.append(submission.rows, submission.images)
         done = maintain(
             memory,
-            commit.episode,
+            Moment(commit.episode, record["totals"]["actions"], record["actions"]),
             self._config,
             self._predictor,
             describing=self._progress("descriptors"),

@@ -27,8 +27,3 @@ def equalised(rewards: Floats, values: Floats, config: MemoryConfig) -> Floats:
     if config.protect_terminal:
         fresh = np.where(rewards == np.float32(TERMINAL_REWARD), rewards, fresh)
     return fresh.astype(np.float32)
-
-
-def due(episode: int, every: int) -> bool:
-    """Whether a periodic step falls on this global episode number; 0 means never (E25)."""
-    return every > 0 and episode > 0 and episode % every == 0

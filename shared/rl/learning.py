@@ -17,10 +17,10 @@ from torch.optim.rmsprop import rmsprop
 from shared.rl.batches import Batches, Mask, Ranks
 from shared.rl.draws import generator
 from shared.rl.engine import arithmetic
-from shared.rl.equalisation import due
 from shared.rl.gradients import Gradients, Losses, MeanOfWeights
 from shared.rl.memory import SampleStore
 from shared.rl.network import QNetwork, initialised
+from shared.rl.schedule import Moment, due
 
 if TYPE_CHECKING:
     from shared.config import LearningConfig, NetworkConfig, Numerics
@@ -70,18 +70,18 @@ class Trainer:
         """Go on with another schedule, target rule or rate. Call between episodes."""
         self._learning = learning
 
-    def learn(self, samples: SampleStore, episode: int) -> Iterator[Trained]:
-        """Everything the network learns at one episode (E25); yields after each mini-batch.
+    def learn(self, samples: SampleStore, now: Moment) -> Iterator[Trained]:
+        """Everything the network learns after one episode (E25); yields after each mini-batch.
 
         A fitting phase when due, else `mini_batches_per_episode` steps.
         """
         self._mean.restart()
         if not len(samples):
             return
-        if due(episode, self._learning.fit_every):
-            yield from self._fit(samples, episode)
+        if due(now, self._learning.fit_every, self._learning.fit_every_actions):
+            yield from self._fit(samples, now.episode)
         else:
-            yield from self._mini_batches(samples, episode)
+            yield from self._mini_batches(samples, now.episode)
 
     def fit_batches(self, samples: int) -> int:
         """Mini-batches of a whole fitting phase over this number of samples."""

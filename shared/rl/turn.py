@@ -14,10 +14,11 @@ import numpy.typing as npt
 
 from shared.columns import EPISODE
 from shared.rl.engine import Progress
-from shared.rl.equalisation import due, equalised
+from shared.rl.equalisation import equalised
 from shared.rl.memory import SAMPLE, Images, ReplayMemory, world_indices
 from shared.rl.predictor import Predictor
 from shared.rl.retention.strategy import Discard, Situation, beyond, discard
+from shared.rl.schedule import Moment, due
 
 if TYPE_CHECKING:
     from shared.config import MemoryConfig
@@ -55,16 +56,16 @@ def sample_rows(
 
 def maintain(
     memory: ReplayMemory,
-    number: int,
+    now: Moment,
     config: MemoryConfig,
     predictor: Predictor,
     *,
     describing: Progress | None = None,
     equalising: Progress | None = None,
 ) -> Maintenance:
-    """Discard and, when due at episode `number`, equalise after it. `memory` is changed."""
-    discarded = discard(Situation(memory, number, config, predictor, describing))
-    refresh = due(number, config.equalise_every) and len(memory) > 0
+    """Discard and, when due, equalise after it. `memory` is changed."""
+    discarded = discard(Situation(memory, now.episode, config, predictor, describing))
+    refresh = due(now, config.equalise_every, config.equalise_every_actions) and len(memory) > 0
     if refresh:
         values = _current_values(memory, predictor, equalising)
         memory.rows["reward"] = equalised(memory.rows["reward"], values, config)

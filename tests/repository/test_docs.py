@@ -183,7 +183,11 @@ def _leads(start: object, name: str) -> bool:
     for part in name.split("."):
         if not hasattr(start, part):
             # Methods are also named after their module's only class: `learning.step`.
-            classes = [value for value in vars(start).values() if isinstance(value, type)]
+            classes = [
+                value
+                for value in getattr(start, "__dict__", {}).values()
+                if isinstance(value, type)
+            ]
             start = next((cls for cls in classes if hasattr(cls, part)), None)
             if start is None:
                 return False

@@ -38,6 +38,7 @@ from builders import FakePredictor, make_episode
 from services.replay.storage import Storage
 from shared.config import MemoryConfig
 from shared.rl.retention.strategy import strategy
+from shared.rl.schedule import Moment
 from shared.rl.turn import maintain
 from shared.run_record import REPLAY_COLUMNS
 
@@ -49,7 +50,7 @@ for number in (1, 2, 3):
     storage.commit(make_episode(20, seed=number))
     pending = storage.pending(number - 1)
     memory.append(pending.rows, pending.images)
-    done = maintain(memory, number, config, FakePredictor())
+    done = maintain(memory, Moment(number), config, FakePredictor())
     storage.apply_turn(pending, memory, done)
     assert done.discarded.told["threshold_percent"] == 1, done
     told.append(done.discarded.told["discards"])

@@ -20,6 +20,7 @@ from services.replay.storage import Storage
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import load_world
 from shared.config import Config, MemoryConfig
+from shared.rl.schedule import Moment
 from shared.rl.turn import maintain
 
 ROOT = Path(__file__).parents[2]
@@ -87,7 +88,7 @@ def store_and_mirror(called: dict[str, int], folder: Path) -> None:
         pending = storage.pending(number - 1)
         assert pending is not None
         memory.append(pending.rows, pending.images)
-        done = maintain(memory, number, config, FakePredictor())
+        done = maintain(memory, Moment(number), config, FakePredictor())
         position = storage.apply_turn(pending, memory, done)
         mirror.reach(FeedBus(), position.change)  # type: ignore[arg-type]
 

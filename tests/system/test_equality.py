@@ -21,9 +21,10 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]
 def config() -> Config:
     """Everything that changes memory or weights happens within 62 episodes.
 
-    Discards, growth and then a higher threshold, marks by decree, equalisation, fitting phases and
-    target copies. What the network learns differs between processors, so nothing here depends on
-    it: every search looks for more candidates than there can be, and so late a decree leaves marks.
+    Discards, growth and then a higher threshold, marks by decree, target copies, and after so many
+    actions equalisation and fitting phases. What the network learns differs between processors, so
+    nothing here depends on it: every search looks for more candidates than there can be, and so
+    late a decree leaves marks.
     """
     memory = {
         "capacity_max": 430,
@@ -31,8 +32,10 @@ def config() -> Config:
         "recompute_below": 500,
         "raise_at_most": 500,
         "mark_all_at_episode": EPISODES - 4,
+        "equalise_every_actions": 130,
     }
-    return make_config("equality", run={"episodes": EPISODES}, memory=memory)
+    run, learning = {"episodes": EPISODES}, {"fit_every_actions": 210}
+    return make_config("equality", run=run, memory=memory, learning=learning)
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,8 @@ from experiments.baseline import dqn
 from experiments.baseline.dqn import EVALUATIONS, BaselinePlan, DistanceReward, planned
 from experiments.drives.choosers import Chooser, uniform
 from experiments.environment import CorridorEnv
-from experiments.plans.plan import load_plan, stage_config
+from experiments.plans.plan import stage_config
+from experiments.plans.scales import load_plan
 from experiments.records import EVALUATION_COLUMNS
 from experiments.report.run_folder import read_info
 from services.robot_driver.robot import Pose
@@ -69,15 +70,15 @@ def test_reports_can_read_what_was_run(tmp_path: Path) -> None:
 
 
 def test_what_is_shared_with_ours_comes_from_the_plan() -> None:
-    words = "--like plus-minus --scale mini --seed 5 --threads 2 --reward distance --out x"
+    words = "--like plus-minus --scale tenth --seed 5 --threads 2 --reward distance --out x"
     made = planned(words.split())
-    ours = load_plan("plus-minus", "mini")
+    ours = load_plan("plus-minus", "tenth")
     config, last = made.config, stage_config(ours, len(ours.stages) - 1, 5)
     assert (config.network, config.robot, config.episode) == (
         last.network, last.robot, last.episode,
     )  # fmt: skip
     assert (config.memory.capacity, config.run.seed) == (last.memory.capacity, 5)
-    assert (made.scale, made.factor, config.numerics.learner.threads) == ("mini", 20, 2)
+    assert (made.scale, made.factor, config.numerics.learner.threads) == ("tenth", 10, 2)
 
 
 def test_an_unknown_plan_is_refused_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from experiments.plans.plan import SCALES, load_plan, merged, plan_names, read_plan, stage_config
+from experiments.plans.plan import full_plan, merged, plan_names, read_plan, stage_config
+from experiments.plans.scales import SCALES, load_plan
 from services.robot_driver.simulated.world import load_world
 from shared.errors import ConfigError
 from shared.messages import WorldChange
@@ -23,9 +24,6 @@ until = 99
 [stages.config.learning]
 fit_every = 25
 mini_batches_per_episode = 2
-[mini]
-factor = 10
-mini_batches = 3
 """
 THESIS = {
     # stage by stage: episodes, memory, strategy, mini-batches, fit every, highest threshold, world
@@ -50,7 +48,7 @@ THESIS = {
 @pytest.mark.parametrize("name", THESIS)
 def test_full_scale_has_the_constants_of_the_thesis(name: str) -> None:
     """A38-A43."""
-    plan = load_plan(name, "full")
+    plan = full_plan(name)
     found = []
     for index, stage in enumerate(plan.stages):
         config = stage_config(plan, index, 1)
@@ -75,7 +73,7 @@ def test_full_scale_has_the_constants_of_the_thesis(name: str) -> None:
 def test_only_the_policy_differs_between_compared_policies() -> None:
     """A38: equal weights and memory at the beginning come from an equal seed."""
     configs = [
-        stage_config(load_plan(f"policy-{kind}", "full"), 0, 1).to_dict()
+        stage_config(full_plan(f"policy-{kind}"), 0, 1).to_dict()
         for kind in ("eps-greedy", "roulette", "eps-greedy-roulette")
     ]
     kinds = [config["policy"].pop("kind") for config in configs]
@@ -90,7 +88,7 @@ def test_only_the_policy_differs_between_compared_policies() -> None:
     [("plus-minus", "plus-minus-normm"), ("plus-rmm-nopretrain", "plus-normm-fit-alone")],
 )
 def test_only_the_strategy_differs_between_compared_memories(ours: str, beside: str) -> None:
-    trees = [stage_config(load_plan(name, "mini"), 0, 1).to_dict() for name in (ours, beside)]
+    trees = [stage_config(load_plan(name, "tenth"), 0, 1).to_dict() for name in (ours, beside)]
     for tree in trees:
         for key in ("threshold_percent", "threshold_max_percent"):  # of RMM alone
             del tree["memory"][key]
@@ -111,7 +109,7 @@ def test_rmm_is_taken_apart_one_part_at_a_time(
     name: str, section: str, changed: dict[str, tuple[int, int]]
 ) -> None:
     whole, apart = (
-        stage_config(load_plan(plan, "full"), 0, 1).to_dict()
+        stage_config(full_plan(plan), 0, 1).to_dict()
         for plan in ("plus-rmm-nopretrain", f"plus-rmm-{name}")
     )
     del whole["run"]["name"], apart["run"]["name"]
@@ -124,56 +122,25 @@ def test_rmm_is_taken_apart_one_part_at_a_time(
 @pytest.mark.parametrize("scale", SCALES)
 def test_every_plan_can_be_run_after_its_predecessor(scale: str) -> None:
     for name in plan_names():
-        plan = load_plan(name, scale)  # type: ignore[arg-type]
+        plan = load_plan(name, scale)
         assert plan.after in ("", *plan_names())
         if plan.after:  # goes on with the same network and seeds
-            before = load_plan(plan.after, scale)  # type: ignore[arg-type]
+            before = load_plan(plan.after, scale)
             assert stage_config(before, 0, 1).network == stage_config(plan, 0, 1).network
             assert plan.seeds == before.seeds
 
 
-def test_every_mini_plan_has_the_narrow_network_unless_it_says_otherwise() -> None:
-    config = stage_config(read_plan("small", SMALL, "mini"), 0, 1)
-    assert (config.network.filters, config.network.layout) == (16, "cpcccp")
-    assert (config.numerics.learner.batch, config.numerics.replay.engine) == (16, "auto")
-    own = SMALL + "[mini.config.network]\nfilters = 8\n[mini.config.numerics.learner]\nbatch = 4\n"
-    config = stage_config(read_plan("small", own, "mini"), 1, 1)
-    assert (config.network.filters, config.network.layout) == (8, "cpcccp")
-    assert config.numerics.learner.batch == 4
-    full = stage_config(read_plan("small", own, "full"), 0, 1)
-    assert full.network.filters == 64
-    assert (full.numerics.learner.batch, full.numerics.learner.device) == (8, "auto")
-
-
-def test_mini_divides_sizes_and_periods_and_nothing_else() -> None:
-    plan = read_plan("small", SMALL, "mini")
-    first, second = (stage_config(plan, i, 1) for i in (0, 1))
-    assert [stage.until for stage in plan.stages] == [4, 9]
-    assert (first.memory.capacity, first.memory.equalise_every) == (40, 5)
-    assert (first.learning.fit_every, second.learning.fit_every) == (10, 2)
-    assert first.learning.mini_batches_per_episode == 3  # of 1, the default
-    assert second.learning.mini_batches_per_episode == 6
-    assert second.memory.capacity == 40  # kept from the stage before
-    text = SMALL.replace("factor = 10", "factor = 10\nmemory_factor = 4")
-    assert stage_config(read_plan("small", text, "mini"), 0, 1).memory.capacity == 100
-    full = stage_config(read_plan("small", SMALL, "full"), 1, 1)
-    assert full.learning.mini_batches_per_episode == 2
-    assert full.network.filters == 64
-
-
 def test_a_plan_can_say_what_it_is_like() -> None:
-    plan = read_plan(
-        "other", 'like = "plus-minus"\ntitle = "t"\n[config.memory]\ncapacity = 60', "full"
-    )
-    model = load_plan("plus-minus", "full")
+    plan = read_plan("other", 'like = "plus-minus"\ntitle = "t"\n[config.memory]\ncapacity = 60')
+    model = full_plan("plus-minus")
     assert (plan.title, plan.after, plan.stages) == ("t", model.after, model.stages)
     assert plan.config["memory"] == {**model.config["memory"], "capacity": 60}
     assert not plan.thesis  # those figures are the other one's
-    twice = read_plan("other", 'like = "plus-minus-normm"\ntitle = "t"', "full")
-    assert twice.config["memory"] == load_plan("plus-minus-normm", "full").config["memory"]
+    twice = read_plan("other", 'like = "plus-minus-normm"\ntitle = "t"')
+    assert twice.config["memory"] == full_plan("plus-minus-normm").config["memory"]
     assert not twice.thesis
     with pytest.raises(ConfigError, match="plus-minus is like itself"):
-        read_plan("plus-minus", 'like = "plus-minus-normm"', "full")
+        read_plan("plus-minus", 'like = "plus-minus-normm"')
 
 
 def test_merging_changes_neither_tree() -> None:
@@ -189,26 +156,25 @@ def test_merging_changes_neither_tree() -> None:
         (('name = "b"', 'name = "a"'), "names must differ"),
         (("capacity = 400", 'capacity = "many"'), "stage a: memory.capacity"),
         (("fit_every = 25", "fit_evry = 25"), "stage b: learning.fit_evry"),
-        (("factor = 10", "factor = 0"), "mini.factor"),
         (('title = "t"', ""), "title"),
         (("[[stages]]", "[[stages"), "expected TOML"),
     ],
 )
 def test_a_wrong_plan_is_refused_in_one_line(change: tuple[str, str], complaint: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        read_plan("small", SMALL.replace(*change), "full")
+        read_plan("small", SMALL.replace(*change))
     assert complaint in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_an_unknown_plan_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ConfigError, match="plus-rmm"):
-        load_plan("plus-rnm", "mini")
+        load_plan("plus-rnm", "tenth")
 
 
 def test_i16c_lets_the_memory_grow_and_marks_what_was_there_before() -> None:
     """A44."""
-    plan = load_plan("i16c", "full")
+    plan = full_plan("i16c")
     memory = stage_config(plan, 0, 1).memory
     assert (memory.capacity, memory.capacity_max, memory.capacity_step) == (50000, 90000, 5000)
     assert (memory.threshold_percent, memory.threshold_max_percent) == (5, 7)
@@ -216,18 +182,19 @@ def test_i16c_lets_the_memory_grow_and_marks_what_was_there_before() -> None:
     assert (plan.after, plan.stages[0].until) == ("plus-minus", 3000)
     kinds = [change["kind"] for change in plan.stages[0].changes]
     assert {"place", "remove"} <= set(kinds)
-    mini = stage_config(load_plan("i16c", "mini"), 0, 1).memory
-    assert (mini.capacity, mini.capacity_max, mini.capacity_step) == (10000, 18000, 1000)
+    small = stage_config(load_plan("i16c", "tenth"), 0, 1).memory
+    assert (small.capacity, small.capacity_max, small.capacity_step) == (5000, 9000, 500)
 
 
 @pytest.mark.parametrize("name", plan_names())
 def test_obstacles_of_a_schedule_are_there_when_removed_and_not_when_placed(name: str) -> None:
-    plan = load_plan(name, "full")
+    plan = full_plan(name)
     for index, stage in enumerate(plan.stages):
         world = load_world(stage_config(plan, index, 1).robot.world)
         there = {obstacle.name for obstacle in world.obstacles}
-        for tree in sorted(stage.changes, key=lambda change: change["at_episode"]):
-            change = WorldChange.model_validate(tree)
+        for tree in sorted(stage.changes, key=lambda change: change["at"]):
+            fields = {key: value for key, value in tree.items() if key != "at"}
+            change = WorldChange.model_validate(fields)
             if change.box is not None:
                 assert change.box.name not in there
                 there.add(change.box.name)

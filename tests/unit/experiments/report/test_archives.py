@@ -30,7 +30,7 @@ def test_runs_are_the_same_from_an_archive(tmp_path: Path) -> None:
         (folder / "tours.json").write_text("[]")
     archives.keep([tmp_path / "runs"], tmp_path / "kept", arrays=True)
     (path,) = (tmp_path / "kept").iterdir()
-    assert path.name == "plus-rmm-mini.tar.xz"
+    assert path.name == "plus-rmm-tenth.tar.xz"
     (ours,), (theirs,) = load([tmp_path / "runs"]), archives.load([path])
     assert [run.info for run in ours.runs] == [run.info for run in theirs.runs]
     assert [run.episodes for run in ours.runs] == [run.episodes for run in theirs.runs]
@@ -43,7 +43,7 @@ def test_predictions_are_kept_only_if_asked_for_and_of_the_lowest_seed(tmp_path:
         write_run(tmp_path / "runs", NAME, seed)
     for arrays in (True, False):
         archives.keep([tmp_path / "runs"], tmp_path / "kept", arrays=arrays)
-        names = archives.read(tmp_path / "kept" / "plus-rmm-mini.tar.xz")
+        names = archives.read(tmp_path / "kept" / "plus-rmm-tenth.tar.xz")
         assert any(n.startswith("seed-1/probes-") for n in names) == arrays
         assert [n for n in names if n.startswith("seed-2/")] == [
             "seed-2/episodes.csv", "seed-2/evaluations.csv", "seed-2/run.json",

@@ -49,9 +49,9 @@ def test_another_method_is_compared_at_its_scale(tmp_path: Path) -> None:
         left = {key: info[key] for key in info if key not in ("after", "prefill", "first_lap")}
         left |= {"experiment": "dqn-distance", "actions": 5000}
         (other / "run.json").write_text(json.dumps(left))
-    found = load([tmp_path / "other", tmp_path / "plus-rmm-mini"])
+    found = load([tmp_path / "other", tmp_path / "plus-rmm-tenth"])
     (section,) = compared(found)
-    assert section.name == "comparisons-mini"
+    assert section.name == "comparisons-tenth"
     assert "plus-rmm had fewer bumps than dqn-distance in plus" in sentences(section)
     assert found[0].runs[0].actions == 5000  # there are no episodes to add up
 
@@ -139,8 +139,6 @@ capacity = 1000
 [[stages]]
 name = "learn"
 until = 100
-[mini]
-factor = 10
 [report]
 groups = ["new-group"]
 {report}
@@ -177,7 +175,7 @@ def test_a_plan_of_ones_own_is_compared_without_code(tmp_path: Path) -> None:
     assert "Frozen evaluation in plus, one, three, two" in titles(section)
     assert "Predicted rewards in plus, one and two (Fig 9.3)" in titles(section)
     assert "Fitness (Fig 9.2)" in titles(first)
-    assert first.name == "one-mini"
+    assert first.name == "one-tenth"
     tables = [block.title for block in section.blocks if isinstance(block, Table)]
     assert tables[0].endswith("(Fig 9.1)")
     assert (
@@ -194,7 +192,7 @@ def test_a_plan_of_ones_own_is_compared_without_code(tmp_path: Path) -> None:
 )
 def test_a_plan_that_asks_for_what_there_is_not_is_refused(report: str) -> None:
     with pytest.raises(ConfigError, match=r"plan mine: report\."):
-        read_plan("mine", PLAN.format(title="Mine", report=report), "full")
+        read_plan("mine", PLAN.format(title="Mine", report=report))
 
 
 def test_no_code_of_reports_names_an_experiment() -> None:

@@ -16,7 +16,7 @@ from tests.synthetic_runs import write_run
 NAMES = ("policy-eps-greedy", "policy-roulette")
 TEMPLATE = """# A page
 
-<!-- show: policy-roulette-mini-fitness -->
+<!-- show: policy-roulette-tenth-fitness -->
 
 Text by hand.
 
@@ -66,7 +66,7 @@ def test_figures_and_tables_stand_where_the_text_says(docs: Path) -> None:
     assert "<!-- show" not in page
     shown = set(re.findall(r"\]\(images/results/([^)]+)\)", page))
     assert shown == {path.name for path in (docs / "images" / "results").iterdir()}
-    assert shown == {"policy-roulette-mini-fitness.png"}
+    assert shown == {"policy-roulette-tenth-fitness.png"}
 
 
 def test_a_figure_that_no_kept_run_gives_is_named(docs: Path, tmp_path: Path) -> None:

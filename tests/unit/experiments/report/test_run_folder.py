@@ -26,7 +26,7 @@ def test_seeds_of_an_experiment_come_together_from_any_level(tmp_path: Path) -> 
     other = write_run(tmp_path, "policy-eps-greedy", 1)
     for given in ([tmp_path], [seeds[0].parent, other], [*seeds, other, tmp_path]):
         experiments = load(given)
-        assert [e.full_name for e in experiments] == ["policy-eps-greedy-mini", f"{NAME}-mini"]
+        assert [e.full_name for e in experiments] == ["policy-eps-greedy-tenth", f"{NAME}-tenth"]
         assert [run.info.seed for run in experiments[1].runs] == [1, 2]
 
 

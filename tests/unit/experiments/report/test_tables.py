@@ -39,11 +39,11 @@ def test_every_seed_and_both_references_have_a_row(tmp_path: Path) -> None:
             for d, b in (("random", 77), ("planner", 0))
         ]
         write_csv(path, EVALUATION_COLUMNS, [*kept, *made])
-    info = tmp_path / "plus-rmm-mini" / "seed-2" / "run.json"
+    info = tmp_path / "plus-rmm-tenth" / "seed-2" / "run.json"
     told = json.loads(info.read_text())
     told["first_lap"] = {"seconds": 61.5, "actions": 8123, "episode": 40, "train_steps": 94}
     info.write_text(json.dumps(told))
-    info = tmp_path / "plus-rmm-mini" / "seed-1" / "run.json"
+    info = tmp_path / "plus-rmm-tenth" / "seed-1" / "run.json"
     told = json.loads(info.read_text())
     told["first_lap"] = {}
     info.write_text(json.dumps(told))
@@ -97,7 +97,7 @@ def test_every_test_drive_has_a_row_and_a_damaged_file_is_named(tmp_path: Path) 
     (told,) = findings.tours(experiment)
     assert "1 of 3 test drives were full and without a bump, 1 more without a bump but" in told
     (counted,) = tables.test_drives([experiment]).rows
-    assert counted == ("i16c-test", "mini", "1", "1 of 3", "2 of 3", "0, 0, 2")
+    assert counted == ("i16c-test", "tenth", "1", "1 of 3", "2 of 3", "0, 0, 2")
     assert any(getattr(block, "rows", ()) == (counted,) for block in overview([experiment]).blocks)
     section = all_sections([experiment])[-1]
     assert any(block == table for block in section.blocks)
@@ -113,7 +113,7 @@ def test_memories_are_told_of_where_runs_tell(tmp_path: Path) -> None:
     write_run(tmp_path, "plus-normm", 1)
     (found,) = [e for e in load([tmp_path]) if e.name == "plus-rmm"]
     actions = [run.actions / 4500 for run in found.runs]
-    (row,) = tables.memories(load([tmp_path]), "mini").rows
+    (row,) = tables.memories(load([tmp_path]), "tenth").rows
     assert row[:2] == ("plus-rmm", "1, 2")
     assert row[2].startswith(f"{np.median(actions):.3g}")
     assert row[3:] == ("50 (25 to 75)", "50 (50 to 50)", "0.125 (0.125 to 0.125)")

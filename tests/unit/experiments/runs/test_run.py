@@ -50,7 +50,7 @@ threshold_percent = 2
 world = "{second}"
 [[stages.changes]]
 kind = "place"
-at_episode = 5
+at = 5
 [stages.changes.box]
 name = "box"
 x_m = -3.8
@@ -65,21 +65,36 @@ every_starts = 1
 every_length = 50
 starts = 1
 actions = 50
-lap_every_actions = 100
-[mini]
-factor = 1
+lap_every_actions = {laps}
 """
 
 
 def plan(name: str, **parts: str) -> Plan:
     given = {"after": "", "fill": "", "second_fill": "policy", "first": "plus", "second": "plus"}
-    return read_plan(name, TEXT.format(**{**given, **parts}), "full")
+    given["laps"] = "300"
+    return read_plan(name, TEXT.format(**{**given, **parts}))
 
 
 FIRST = plan("one")
 GROWING = plan(
     "growing",
     fill="capacity_max = 400\ncapacity_step = 100\nrecompute_below = 999\nraise_at_most = 999",
+    laps="0",
+)
+COUNTING = read_plan(
+    "counting",
+    TEXT.format(
+        after='counted_in = "actions"',
+        fill="equalise_every_actions = 25",
+        second_fill="none",
+        first="plus",
+        second="plus",
+        laps="0",
+    )
+    .replace("batch_size = 16", "batch_size = 16\nfit_every_actions = 35\nfit_epochs = 1")
+    .replace("until = 3\n", "until = 40\n")
+    .replace("until = 7\n", "until = 130\n")
+    .replace("at = 5\n", "at = 60\n"),
 )
 TEST_DRIVE = read_plan(
     "drive",
@@ -92,10 +107,7 @@ TEST_DRIVE = read_plan(
     network = { filters = 4 }
     learning = { batch_size = 16 }
     robot = { world = "i16c" }
-    [mini]
-    factor = 1
     """,
-    "full",
 )
 SECOND = plan("two", after='after = "one"', first="minus", fill='fill = "none"', second_fill="none")
 
@@ -111,7 +123,7 @@ def run(
     done: list[Progress] = []
     one = Run(a_plan, "full", 1, folder, before, "command")
     try:
-        return one.go(done.append, lambda: len(done) >= turns or done[-1].episode >= episodes)
+        return one.go(done.append, lambda: len(done) >= turns or done[-1].done >= episodes)
     finally:
         one.close()
 
@@ -163,6 +175,29 @@ def test_a_memory_that_has_grown_is_as_large_after_a_stop(tmp_path: Path) -> Non
     assert tables(parted) == tables(whole)
     capacities = [int(row["capacity"]) for row in tables(whole)["episodes"]]
     assert capacities == [60] * 3 + [250] * 4
+
+
+def test_a_plan_that_counts_actions_does_all_by_them(tmp_path: Path) -> None:
+    """E39: stages, fitting phases, equalisation and changes, however long episodes are."""
+    whole, parted = tmp_path / "whole" / "counting", tmp_path / "parted" / "counting"
+    assert run(COUNTING, whole)
+    assert not run(COUNTING, parted, turns=4)
+    assert not run(COUNTING, parted, turns=3)
+    assert run(COUNTING, parted)
+    rows = tables(whole)["episodes"]
+    assert tables(parted)["episodes"] == rows
+    totals = [int(row["total_actions"]) for row in rows]
+    ends = {name: max(t for t, row in zip(totals, rows, strict=True) if row["stage"] == name)
+            for name in ("a", "b")}  # fmt: skip
+    lengths = {int(row["episode"]): int(row["actions"]) for row in rows}
+    last = {row["stage"]: lengths[int(row["episode"])] for row in rows}
+    for name, until in (("a", 40), ("b", 130)):
+        assert until <= ends[name] < until + last[name]
+    before = [0, *totals[:-1]]
+    for every, column in ((35, "fitting"), (25, "equalised")):
+        due = [t // every > b // every for t, b in zip(totals, before, strict=True)]
+        assert [row[column] == "1" for row in rows] == due
+        assert 1 < sum(due) < len(rows)
 
 
 def test_a_second_fill_ends_with_exactly_the_capacity(finished: Path) -> None:
@@ -314,8 +349,8 @@ def test_a_damaged_snapshot_is_refused(tmp_path: Path) -> None:
 
 
 def test_chains_begin_with_their_first_plan_and_share_runs() -> None:
-    assert [each.name for each in chain("plus-minus", "mini")] == ["plus-rmm", "plus-minus"]
-    jobs = {name: Job(name, "mini", 1, Path()) for name in ("a", "b", "c", "d")}
+    assert [each.name for each in chain("plus-minus", "tenth")] == ["plus-rmm", "plus-minus"]
+    jobs = {name: Job(name, "tenth", 1, Path()) for name in ("a", "b", "c", "d")}
     a, b, c, d = jobs.values()
     assert _distinct([[a, b], [a, c], [d]]) == [[a, b, c], [d]]
 

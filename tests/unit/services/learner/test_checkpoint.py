@@ -18,6 +18,7 @@ from shared.errors import StateError
 from shared.rl.learning import Trainer
 from shared.rl.memory import SampleStore
 from shared.rl.network import to_bytes
+from shared.rl.schedule import Moment
 
 torch.set_num_threads(1)
 IDENTITY = "run1/0123456789abcdef"
@@ -32,7 +33,7 @@ def train(trainer: Trainer, episodes: range) -> None:
     store = SampleStore()
     fill_store(store, range(1, 9), [0, 1, 2] * 2 + [0, 1], np.linspace(-1, 1, 8).tolist())
     for episode in episodes:
-        list(trainer.learn(store, episode))
+        list(trainer.learn(store, Moment(episode)))
         trainer.apply_target_rule(episode, bump=episode % 2 == 0)
 
 

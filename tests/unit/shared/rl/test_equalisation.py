@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from shared.config import MemoryConfig
 from shared.rl import memory as memory_module
-from shared.rl.equalisation import due, equalised
+from shared.rl.equalisation import equalised
 from shared.rl.memory import ReplayMemory
+from shared.rl.schedule import Moment
 from shared.rl.turn import maintain
 
 FAST = settings(deadline=None, max_examples=80, derandomize=True)
@@ -48,16 +49,6 @@ def test_terminal_rewards_drift_unless_protected() -> None:
     assert equalised(terminal, value, MemoryConfig(protect_terminal=True))[0] == -1.0
 
 
-def test_due_on_multiples_of_the_period_only() -> None:
-    assert [e for e in range(201) if due(e, 50)] == [50, 100, 150, 200]
-
-
-@pytest.mark.parametrize("episode", [0, 1, 50])
-def test_never_due_while_filling_or_with_period_zero(episode: int) -> None:
-    assert not due(episode, 0)
-    assert not due(0, 50)
-
-
 @pytest.mark.parametrize(
     ("episode", "expected"), [(0, False), (49, False), (50, True), (51, False)]
 )
@@ -66,7 +57,7 @@ def test_every_sample_of_the_memory_is_equalised_when_due(episode: int, expected
     fill_store(memory, range(1, 8), [0, 1, 2, 0, 1, 2, 0], [-1.0, 0.1, 0.2, 0.3, 0.4, 0.5, 1.0])
     before = memory.rows["reward"].tolist()
     predictor = FakePredictor(version=4)
-    done = maintain(memory, episode, MemoryConfig(capacity=30), predictor)  # type: ignore[arg-type]
+    done = maintain(memory, Moment(episode), MemoryConfig(capacity=30), predictor)  # type: ignore[arg-type]
     assert done.equalised is expected
     for rank, old in enumerate(before):
         image = memory.images(np.array([rank]))[0].tobytes()
@@ -76,7 +67,7 @@ def test_every_sample_of_the_memory_is_equalised_when_due(episode: int, expected
 
 
 def test_an_empty_memory_is_not_equalised() -> None:
-    done = maintain(ReplayMemory(30), 50, MemoryConfig(capacity=30), FakePredictor())  # type: ignore[arg-type]
+    done = maintain(ReplayMemory(30), Moment(50), MemoryConfig(capacity=30), FakePredictor())  # type: ignore[arg-type]
     assert not done.equalised
 
 
@@ -85,7 +76,7 @@ def test_what_is_discarded_is_not_equalised_and_what_remains_is() -> None:
     memory = ReplayMemory(30)
     config = MemoryConfig(capacity=30, strategy="normm", equalise_every=1)
     fill_store(memory, range(1, 32), [0] * 31, [0.5] * 31)
-    done = maintain(memory, 1, config, FakePredictor())  # type: ignore[arg-type]
+    done = maintain(memory, Moment(1), config, FakePredictor())  # type: ignore[arg-type]
     assert list(done.discarded.ids) == [1, 2]
     assert done.equalised
     assert (memory.rows["reward"] != 0.5).all()
@@ -118,7 +109,7 @@ def test_a_pass_sees_some_images_at_a_time_and_reports_how_much_of_all(
     valued: list[tuple[int, int]] = []
     done = maintain(
         memory,
-        1,
+        Moment(1),
         MemoryConfig(capacity=30, equalise_every=1),
         predictor,  # type: ignore[arg-type]
         describing=lambda *progress: described.append(progress),

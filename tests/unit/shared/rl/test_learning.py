@@ -18,6 +18,7 @@ from shared.rl.engine import network_input
 from shared.rl.learning import Trained, Trainer
 from shared.rl.memory import SampleStore
 from shared.rl.network import QNetwork, to_bytes
+from shared.rl.schedule import Moment
 
 torch.set_num_threads(1)
 SMALL = NetworkConfig(filters=4)
@@ -158,7 +159,7 @@ def test_a_loss_that_is_not_finite_changes_nothing(cause: str) -> None:
 @given(n=st.integers(1, 60), size=st.integers(1, 40), batches=st.integers(0, 4))
 def test_mini_batches_are_drawn_without_replacement(n: int, size: int, batches: int) -> None:
     recorder = Recorder(batch_size=size, mini_batches_per_episode=batches, fit_every=0)
-    trained = list(recorder.learn(make_store(n), 3))
+    trained = list(recorder.learn(make_store(n), Moment(3)))
     assert len(recorder.ranks) == batches
     assert [t.batch for t in trained] == list(range(1, batches + 1))
     for ranks in recorder.ranks:
@@ -169,17 +170,17 @@ def test_mini_batches_are_drawn_without_replacement(n: int, size: int, batches: 
 def test_mini_batches_depend_on_seed_episode_and_number_alone() -> None:
     store = make_store(50)
     one = Recorder(batch_size=8, mini_batches_per_episode=2)
-    list(one.learn(store, 7))
+    list(one.learn(store, Moment(7)))
     other = Recorder(batch_size=8, mini_batches_per_episode=2)
-    list(other.learn(store, 3))
-    list(other.learn(store, 7))
+    list(other.learn(store, Moment(3)))
+    list(other.learn(store, Moment(7)))
     assert other.ranks[2:] == one.ranks
     assert len({tuple(ranks) for ranks in other.ranks}) == 4
 
 
 def test_every_sample_is_drawn_now_and_then() -> None:
     recorder = Recorder(batch_size=10, mini_batches_per_episode=100, fit_every=0)
-    list(recorder.learn(make_store(40), 1))
+    list(recorder.learn(make_store(40), Moment(1)))
     counts = np.bincount(np.concatenate([np.array(r) for r in recorder.ranks]), minlength=40)
     assert (abs(counts - 25) < 25).all()
 
@@ -198,7 +199,7 @@ def test_samples_are_trained_by_rank_wherever_their_images_lie() -> None:
     assert plain.rows["slot"].tolist() != churned.rows["slot"].tolist()
     trainers = [make_trainer(batch_size=8), make_trainer(batch_size=8)]
     for trainer, store in zip(trainers, (plain, churned), strict=True):
-        list(trainer.learn(store, 1))
+        list(trainer.learn(store, Moment(1)))
     assert to_bytes(trainers[0].train_network) == to_bytes(trainers[1].train_network)
 
 
@@ -209,7 +210,7 @@ def test_samples_are_trained_by_rank_wherever_their_images_lie() -> None:
 @given(n=st.integers(1, 70), size=st.integers(1, 40), epochs=st.integers(1, 3))
 def test_fitting_visits_each_sample_once_per_epoch(n: int, size: int, epochs: int) -> None:
     recorder = Recorder(batch_size=size, fit_every=10, fit_epochs=epochs)
-    trained = list(recorder.learn(make_store(n), 20))
+    trained = list(recorder.learn(make_store(n), Moment(20)))
     per_epoch = -(-n // size)
     assert len(recorder.ranks) == epochs * per_epoch == recorder.fit_batches(n)
     for epoch in range(epochs):
@@ -225,9 +226,9 @@ def test_fitting_visits_each_sample_once_per_epoch(n: int, size: int, epochs: in
 def test_epochs_are_shuffled_differently_and_the_same_in_a_second_run() -> None:
     first = Recorder(batch_size=50, fit_every=10)
     second = Recorder(batch_size=50, fit_every=10)
-    list(first.learn(make_store(50), 10))
-    list(second.learn(make_store(50), 20))
-    list(second.learn(make_store(50), 10))
+    list(first.learn(make_store(50), Moment(10)))
+    list(second.learn(make_store(50), Moment(20)))
+    list(second.learn(make_store(50), Moment(10)))
     assert second.ranks[3:] == first.ranks
     assert len({tuple(ranks) for ranks in second.ranks}) == 6
     assert first.ranks[0] != sorted(first.ranks[0])
@@ -244,7 +245,7 @@ def test_a_fit_takes_the_place_of_the_mini_batches() -> None:
     recorder = Recorder(batch_size=4, fit_every=5, fit_epochs=1, mini_batches_per_episode=2)
     counts = []
     for episode in range(1, 11):
-        counts.append(len(list(recorder.learn(make_store(8), episode))))
+        counts.append(len(list(recorder.learn(make_store(8), Moment(episode)))))
     assert counts == [2, 2, 2, 2, 2, 2, 2, 2, 2, 2]
     assert [len(r) for r in recorder.ranks] == [4] * 20
     assert recorder.fits == 2
@@ -255,9 +256,9 @@ def test_a_fit_takes_the_place_of_the_mini_batches() -> None:
 def test_the_last_partial_mini_batch_is_a_mean_over_its_own_size() -> None:
     store, trainer = make_store(5), make_trainer(batch_size=4, fit_every=1, fit_epochs=1)
     naive = make_trainer()
-    losses = [t.loss for t in trainer.learn(store, 1)]
+    losses = [t.loss for t in trainer.learn(store, Moment(1))]
     recorder = Recorder(batch_size=4, fit_every=1, fit_epochs=1)
-    list(recorder.learn(store, 1))
+    list(recorder.learn(store, Moment(1)))
     assert [len(r) for r in recorder.ranks] == [4, 1]
     for loss, ranks in zip(losses, recorder.ranks, strict=True):
         assert loss == pytest.approx(
@@ -268,7 +269,7 @@ def test_the_last_partial_mini_batch_is_a_mean_over_its_own_size() -> None:
 
 def test_an_empty_memory_teaches_nothing() -> None:
     trainer = make_trainer(fit_every=1)
-    assert list(trainer.learn(SampleStore(), 1)) == []
+    assert list(trainer.learn(SampleStore(), Moment(1))) == []
     assert (trainer.train_steps, trainer.fits, trainer.fit_batches(0)) == (0, 0, 0)
 
 
@@ -331,7 +332,7 @@ def test_a_restored_trainer_continues_bit_for_bit(steps: int) -> None:
     def go_on(trainer: Trainer, episodes: range) -> list[bytes]:
         seen = []
         for episode in episodes:
-            losses = [t.loss for t in trainer.learn(store, episode)]
+            losses = [t.loss for t in trainer.learn(store, Moment(episode))]
             changed = trainer.apply_target_rule(episode, bump=episode % 2 == 0)
             state = (losses, changed, sorted(trainer.counters().items()))
             seen += [repr(state).encode(), to_bytes(trainer.train_network)]
@@ -345,7 +346,7 @@ def test_a_restored_trainer_continues_bit_for_bit(steps: int) -> None:
     counters = dict(trainer.counters())
     uninterrupted = go_on(trainer, range(1 + steps, 8))
     resumed = make_trainer(**options)
-    list(resumed.learn(store, 77))  # whatever it was before
+    list(resumed.learn(store, Moment(77)))  # whatever it was before
     resumed.restore(tensors, counters)
     assert go_on(resumed, range(1 + steps, 8)) == uninterrupted
 
@@ -424,7 +425,7 @@ def test_half_of_all_samples_are_mirrored_by_chance_where_that_is_wanted() -> No
     ours, again = (Recorder(augmentation="mirror", **settings_of) for _ in range(2))
     for trainer in (plain, ours, again):
         for episode in (1, 2):
-            list(trainer.learn(store, episode))
+            list(trainer.learn(store, Moment(episode)))
     assert plain.mirrored == [None] * 9
     assert ours.ranks == plain.ranks  # the choice of samples stays what it is
     assert [len(mask) for mask in ours.mirrored] == [len(ranks) for ranks in ours.ranks]
@@ -442,7 +443,7 @@ def test_the_target_can_be_the_mean_over_the_newest_steps(episode: int) -> None:
     trainer = make_trainer(target_average=True, batch_size=16, **settings_of)
     newest = [
         (trained.epoch, parameters(trainer.train_network))
-        for trained in trainer.learn(store, episode)
+        for trained in trainer.learn(store, Moment(episode))
     ]
     assert trainer.apply_target_rule(episode, bump=False)
     seen = [weights for epoch, weights in newest if epoch == newest[-1][0]]
@@ -459,7 +460,7 @@ def test_the_mean_begins_anew_with_each_episode() -> None:
     store = make_store(40)
     trainer = make_trainer(target_average=True, batch_size=16, mini_batches_per_episode=1)
     for episode in (1, 3):
-        list(trainer.learn(store, episode))
+        list(trainer.learn(store, Moment(episode)))
         trainer.apply_target_rule(episode, bump=True)
         target = parameters(trainer.target_network)
         for name, weights in parameters(trainer.train_network).items():
@@ -483,10 +484,10 @@ def test_deferred_steps_are_the_same_steps() -> None:
     learning = LearningConfig(fit_every=4, fit_epochs=2, batch_size=5)
     store = make_store(12)
     plain = Trainer(SMALL, learning, LearnerNumerics(batch=4), 1)
-    losses = [t.loss for t in plain.learn(store, 4)]
+    losses = [t.loss for t in plain.learn(store, Moment(4))]
     deferred = Trainer(SMALL, learning, LearnerNumerics(batch=4), 1)
     deferred.gradients.deferred = True
-    steps = list(deferred.learn(store, 4))
+    steps = list(deferred.learn(store, Moment(4)))
     assert [done.epoch for done in steps] == [1, 1, 1, 2, 2, 2]
     assert [done.loss for done in steps[:-1]] == [None] * 5
     assert steps[-1].loss == pytest.approx(np.mean([loss for loss in losses if loss is not None]))
@@ -501,4 +502,4 @@ def test_deferred_steps_report_a_loss_that_is_not_finite() -> None:
     with torch.no_grad():
         trainer.train_network.out.bias.fill_(float("nan"))
     with pytest.raises(FloatingPointError):
-        list(trainer.learn(make_store(8), 100))
+        list(trainer.learn(make_store(8), Moment(100)))

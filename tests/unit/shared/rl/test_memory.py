@@ -24,6 +24,7 @@ from shared.config import MemoryConfig
 from shared.rl import memory as memory_module
 from shared.rl.memory import MIRROR, SAMPLE, ReplayMemory, SampleStore
 from shared.rl.retention.rmm import candidates_by_action, force_candidates
+from shared.rl.schedule import Moment
 from shared.rl.turn import maintain
 
 
@@ -139,7 +140,7 @@ class MemoryMachine(RuleBasedStateMachine):
         """Discard, and equalise when due."""
         config = MemoryConfig(strategy=strategy, rule=marking, equalise_every=int(equalise))
         predictor: Any = FakePredictor(self.version)
-        done = maintain(self.memory, 1, config, predictor)
+        done = maintain(self.memory, Moment(1), config, predictor)
         samples = [
             oracles.Sample(s["id"], s["action"], s["image"][:15], s["candidate"], s["forced"])
             for s in self.model
