@@ -96,7 +96,9 @@ def measure(size: int, rounds: int) -> Times:
         append_black(memory, size - len(memory), draw)  # or there would be nothing to discard
         rows = rows_of(int(memory.ids[-1]) + 1, EPISODE_SAMPLES, draw)
         appends.append(seconds(lambda rows=rows: memory.append(rows, images)))
-        both.append(appends[-1] + seconds(lambda: discard(Situation(memory, 0, config, network))))
+        both.append(
+            appends[-1] + seconds(lambda: discard(Situation(memory, 0, config, network, seed=1)))
+        )
         assert len(memory) < size
     return Times(median(passes), median(appends), median(both))
 

@@ -112,7 +112,7 @@ class SingleProcess:
         )
         self.memory.append(rows, images)
         now = Moment(commit.episode, self.counters.actions, episode.actions)
-        maintenance = maintain(self.memory, now, config.memory, self.judging)
+        maintenance = maintain(self.memory, now, config.memory, self.judging, config.run.seed)
         if not commit.episode:  # the memory is being filled: not an episode, no training (E9)
             return TurnDone(commit, episode, maintenance, (), False)
         trained = tuple(self.trainer.learn(self.memory, now))

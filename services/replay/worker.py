@@ -115,6 +115,7 @@ class TurnWorker(threading.Thread):
             Moment(commit.episode, record["totals"]["actions"], record["actions"]),
             self._config,
             self._predictor,
+            self._me.config.run.seed,
             describing=self._progress("descriptors"),
             equalising=self._progress("equalising"),
         )

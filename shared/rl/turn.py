@@ -59,12 +59,13 @@ def maintain(
     now: Moment,
     config: MemoryConfig,
     predictor: Predictor,
+    seed: int,
     *,
     describing: Progress | None = None,
     equalising: Progress | None = None,
 ) -> Maintenance:
-    """Discard and, when due, equalise after it. `memory` is changed."""
-    discarded = discard(Situation(memory, now.episode, config, predictor, describing))
+    """Discard and, when due, equalise after it. `memory` is changed; `seed` is that of the run."""
+    discarded = discard(Situation(memory, now.episode, config, predictor, seed, describing))
     refresh = due(now, config.equalise_every, config.equalise_every_actions) and len(memory) > 0
     if refresh:
         values = _current_values(memory, predictor, equalising)

@@ -88,7 +88,7 @@ def store_and_mirror(called: dict[str, int], folder: Path) -> None:
         pending = storage.pending(number - 1)
         assert pending is not None
         memory.append(pending.rows, pending.images)
-        done = maintain(memory, Moment(number), config, FakePredictor())
+        done = maintain(memory, Moment(number), config, FakePredictor(), seed=1)
         position = storage.apply_turn(pending, memory, done)
         mirror.reach(FeedBus(), position.change)  # type: ignore[arg-type]
 

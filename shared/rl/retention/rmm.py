@@ -12,6 +12,7 @@ import numpy as np
 
 from shared.facts import ACTION_COUNT, SHORT_NAMES
 from shared.rl.descriptor import BYTES, threshold_bits
+from shared.rl.retention.amounts import surplus_by_action
 from shared.rl.retention.strategy import Discard, Network, Rows, Situation, Strategy, beyond
 from shared.rl.similarity import similar_to_newer
 
@@ -65,7 +66,7 @@ class RMM(Strategy):
             capacity = _grown_capacity(memory, config, failed)
             if failed and capacity == memory.capacity:
                 percent = min(percent + 1, config.threshold_max_percent)
-        ids, last_resort = _oldest_candidates(memory, _surplus(memory, capacity))
+        ids, last_resort = _oldest_candidates(memory, surplus_by_action(memory, capacity))
         return Discard(
             capacity,
             ids,
@@ -109,11 +110,6 @@ def scaled_count(count: int, capacity: int) -> int:
     return max(1, round(count * capacity / THESIS_CAPACITY))
 
 
-def rmm_share(capacity: int) -> int:
-    """Return the samples kept of an action above its share: floor(0.99 N / 3) (A33, E22)."""
-    return 99 * capacity // (100 * ACTION_COUNT)
-
-
 def candidates_by_action(memory: ReplayMemory) -> list[int]:
     """Return the number of discard candidates of each action, marks by decree included (E46)."""
     marked = memory.rows["action"][memory.rows["candidate"]]
@@ -155,17 +151,6 @@ def recompute_marks(
     memory.rows["marked_by"] = network.version
 
 
-def _surplus(memory: ReplayMemory, capacity: int) -> dict[int, int]:
-    """Return the samples each action must lose with this capacity, if any (A33)."""
-    if len(memory) <= capacity:
-        return {}
-    return {
-        action: count - rmm_share(capacity)
-        for action, count in enumerate(memory.by_action())
-        if ACTION_COUNT * count > capacity
-    }
-
-
 def _too_few_candidates(memory: ReplayMemory, config: MemoryConfig) -> bool:
     """Return whether marks must be computed anew (A31, E20)."""
     least = config.recompute_below or scaled_count(RECOMPUTE_BELOW, memory.capacity)
@@ -176,7 +161,7 @@ def _search_failed(memory: ReplayMemory, config: MemoryConfig) -> bool:
     """Return whether some action that must discard still has too few candidates (A32, E19)."""
     most = config.raise_at_most or scaled_count(RAISE_AT_MOST, memory.capacity)
     candidates = candidates_by_action(memory)
-    return any(candidates[action] <= most for action in _surplus(memory, memory.capacity))
+    return any(candidates[action] <= most for action in surplus_by_action(memory, memory.capacity))
 
 
 def _grown_capacity(memory: ReplayMemory, config: MemoryConfig, failed: bool) -> int:
@@ -195,7 +180,7 @@ def _grown_capacity(memory: ReplayMemory, config: MemoryConfig, failed: bool) ->
 def _fewer(memory: ReplayMemory, capacity: int, least: int = 0) -> bool:
     """Return whether an action has fewer candidates than `least` or than must go."""
     candidates = candidates_by_action(memory)
-    surplus = _surplus(memory, capacity)
+    surplus = surplus_by_action(memory, capacity)
     return any(candidates[action] < max(least, count) for action, count in surplus.items())
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from shared.rl.draws import uniform
 from shared.rl.retention.table import STRATEGIES, TELLS
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from shared.rl.memory import Ids, Images, ReplayMemory
 
 Rows = npt.NDArray[np.void]
+Floats = npt.NDArray[np.float64]
 
 
 class Network(Protocol):
@@ -43,6 +45,8 @@ class Situation:
     """Global episode number, 0 while the memory is filled."""
     config: MemoryConfig
     network: Network
+    seed: int
+    """Seed of the run, for strategies that draw by chance."""
     progress: Progress | None = None
     """Called with the images looked at so far, and in all."""
 
@@ -100,6 +104,16 @@ class Strategy(ABC):
 def beyond(before: int, total: int, progress: Progress | None) -> Progress | None:
     """Return what reports the progress of a part as that of the whole."""
     return None if progress is None else lambda done, _: progress(before + done, total)
+
+
+def chances(seed: int, ids: Ids) -> Floats:
+    """Return a number in [0, 1) for each sample by chance, always the same one: float64 [n]."""
+    return uniform(seed, "retention", ids)
+
+
+def lowest(values: Floats, count: int) -> npt.NDArray[np.int64]:
+    """Return the positions of the `count` lowest values, ascending; of equal ones the first."""
+    return np.sort(np.argsort(values, kind="stable")[:count])
 
 
 def strategy(name: str) -> Strategy:

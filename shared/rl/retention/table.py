@@ -20,6 +20,9 @@ class Row(NamedTuple):
 STRATEGIES = {
     "rmm": Row("rmm", tells=("last_resort", "recomputed", "threshold_percent")),
     "normm": Row("normm"),
+    "reservoir": Row("reservoir"),
+    "quotas": Row("quotas"),
+    "quotas-reservoir": Row("quotas_reservoir"),
 }
 TELLS = tuple(name for row in STRATEGIES.values() for name in row.tells)
 """What any strategy tells. It is 0 while a strategy is in force that tells nothing of that name."""

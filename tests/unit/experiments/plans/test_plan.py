@@ -100,13 +100,13 @@ def test_only_the_strategy_differs_between_compared_memories(ours: str, beside: 
 @pytest.mark.parametrize(
     ("name", "section", "changed"),
     [
-        ("quotas", "memory", {"threshold_percent": (1, 100), "threshold_max_percent": (3, 100)}),
+        ("quotas", "memory", {"strategy": ("rmm", "quotas")}),
         ("no-equalisation", "memory", {"equalise_every": (50, 0)}),
         ("no-fits", "learning", {"fit_every": (100, 0)}),
     ],
 )
 def test_rmm_is_taken_apart_one_part_at_a_time(
-    name: str, section: str, changed: dict[str, tuple[int, int]]
+    name: str, section: str, changed: dict[str, tuple[int | str, int | str]]
 ) -> None:
     whole, apart = (
         stage_config(full_plan(plan), 0, 1).to_dict()

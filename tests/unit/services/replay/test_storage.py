@@ -86,7 +86,7 @@ class Bench:
         commit, rows, images = pending.commit, pending.rows, pending.images
         self.memory.append(rows, images)
         predictor: Any = FakePredictor(self.version)
-        done = maintain(self.memory, Moment(commit.episode), self.config, predictor)
+        done = maintain(self.memory, Moment(commit.episode), self.config, predictor, seed=1)
         position = self.storage.apply_turn(pending, self.memory, done)
         self._model_turn(rows, images, commit.episode)
         assert (position.change, position.kept["threshold_percent"]) == (self.change, self.percent)
@@ -338,7 +338,7 @@ def test_a_turn_that_was_begun_but_not_applied_leaves_nothing_behind() -> None:
         memory = b.storage.load()
         memory.append(pending.rows, pending.images)
         predictor: Any = FakePredictor(1)
-        maintain(memory, Moment(1), b.config, predictor)
+        maintain(memory, Moment(1), b.config, predictor, seed=1)
         b.reopen()  # killed here
         assert b.turn()
         b.check()

@@ -57,7 +57,7 @@ def test_every_sample_of_the_memory_is_equalised_when_due(episode: int, expected
     fill_store(memory, range(1, 8), [0, 1, 2, 0, 1, 2, 0], [-1.0, 0.1, 0.2, 0.3, 0.4, 0.5, 1.0])
     before = memory.rows["reward"].tolist()
     predictor = FakePredictor(version=4)
-    done = maintain(memory, Moment(episode), MemoryConfig(capacity=30), predictor)  # type: ignore[arg-type]
+    done = maintain(memory, Moment(episode), MemoryConfig(capacity=30), predictor, seed=1)  # type: ignore[arg-type]
     assert done.equalised is expected
     for rank, old in enumerate(before):
         image = memory.images(np.array([rank]))[0].tobytes()
@@ -67,7 +67,8 @@ def test_every_sample_of_the_memory_is_equalised_when_due(episode: int, expected
 
 
 def test_an_empty_memory_is_not_equalised() -> None:
-    done = maintain(ReplayMemory(30), Moment(50), MemoryConfig(capacity=30), FakePredictor())  # type: ignore[arg-type]
+    memory, config = ReplayMemory(30), MemoryConfig(capacity=30)
+    done = maintain(memory, Moment(50), config, FakePredictor(), seed=1)  # type: ignore[arg-type]
     assert not done.equalised
 
 
@@ -76,7 +77,7 @@ def test_what_is_discarded_is_not_equalised_and_what_remains_is() -> None:
     memory = ReplayMemory(30)
     config = MemoryConfig(capacity=30, strategy="normm", equalise_every=1)
     fill_store(memory, range(1, 32), [0] * 31, [0.5] * 31)
-    done = maintain(memory, Moment(1), config, FakePredictor())  # type: ignore[arg-type]
+    done = maintain(memory, Moment(1), config, FakePredictor(), seed=1)  # type: ignore[arg-type]
     assert list(done.discarded.ids) == [1, 2]
     assert done.equalised
     assert (memory.rows["reward"] != 0.5).all()
@@ -112,6 +113,7 @@ def test_a_pass_sees_some_images_at_a_time_and_reports_how_much_of_all(
         Moment(1),
         MemoryConfig(capacity=30, equalise_every=1),
         predictor,  # type: ignore[arg-type]
+        seed=1,
         describing=lambda *progress: described.append(progress),
         equalising=lambda *progress: valued.append(progress),
     )

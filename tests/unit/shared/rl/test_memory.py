@@ -140,7 +140,7 @@ class MemoryMachine(RuleBasedStateMachine):
         """Discard, and equalise when due."""
         config = MemoryConfig(strategy=strategy, rule=marking, equalise_every=int(equalise))
         predictor: Any = FakePredictor(self.version)
-        done = maintain(self.memory, Moment(1), config, predictor)
+        done = maintain(self.memory, Moment(1), config, predictor, seed=1)
         samples = [
             oracles.Sample(s["id"], s["action"], s["image"][:15], s["candidate"], s["forced"])
             for s in self.model

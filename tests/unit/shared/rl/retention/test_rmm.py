@@ -15,11 +15,10 @@ from oracles import BITS_OF_PERCENT, Sample
 from shared.config import MemoryConfig
 from shared.rl.memory import SAMPLE, ReplayMemory
 from shared.rl.retention import rmm
-from shared.rl.retention.normm import normm_keep
+from shared.rl.retention.amounts import kept_in_total, kept_of_action
 from shared.rl.retention.rmm import (
     candidates_by_action,
     force_candidates,
-    rmm_share,
     scaled_count,
 )
 from shared.rl.retention.strategy import Discard, Situation, discard
@@ -75,7 +74,7 @@ class Bench:
         )
         capacity, percent = self.memory.capacity, self.percent
         decreed = {s.id for s in self.samples if s.forced}
-        found = discard(Situation(self.memory, 0, self.config, self.network))
+        found = discard(Situation(self.memory, 0, self.config, self.network, seed=1))
         assert [int(i) for i in found.ids] == expected.removed
         assert found.told["recomputed"] == expected.recomputed
         assert found.told["last_resort"] == expected.last_resort
@@ -126,15 +125,15 @@ class Bench:
 
 
 def test_kept_counts_are_exact_for_every_capacity() -> None:
-    assert [normm_keep(n) for n in (45000, 100, 101, 2000, 50000, 90000)] == [
+    assert [kept_in_total(n) for n in (45000, 100, 101, 2000, 50000, 90000)] == [
         44550, 99, 99, 1980, 49500, 89100,
     ]  # fmt: skip
-    assert [rmm_share(n) for n in (45000, 300, 100, 2000, 50000, 90000)] == [
+    assert [kept_of_action(n) for n in (45000, 300, 100, 2000, 50000, 90000)] == [
         14850, 99, 33, 660, 16500, 29700,
     ]  # fmt: skip
     for n in range(1, 3000):
-        assert 100 * normm_keep(n) <= 99 * n < 100 * (normm_keep(n) + 1)
-        assert 300 * rmm_share(n) <= 99 * n < 300 * (rmm_share(n) + 1)
+        assert 100 * kept_in_total(n) <= 99 * n < 100 * (kept_in_total(n) + 1)
+        assert 300 * kept_of_action(n) <= 99 * n < 300 * (kept_of_action(n) + 1)
 
 
 def test_counts_of_the_thesis_hold_from_45000_on_and_scale_below() -> None:
