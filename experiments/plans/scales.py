@@ -31,6 +31,7 @@ SCALES = {
     "fifth-wide": Scale(5, narrow=False),
     "tenth": Scale(10, narrow=True),
     "tenth-wide": Scale(10, narrow=False),
+    "forty-fifth": Scale(45, narrow=True),
 }
 LEAST_CAPACITY = 500
 """No memory gets smaller: it is as large as the longest episode, which is as long at any scale."""

@@ -9,19 +9,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 
-from experiments.plans.plan import Plan, Unit, stage_config
+from experiments.plans.plan import Plan, stage_config
 from experiments.plans.scales import divisor_of
 from experiments.records import EVALUATION_COLUMNS
 from experiments.runs import snapshot, stages
 from experiments.runs.episode_row import episode_row, held, memory_hash
 from experiments.runs.observer import EVALUATIONS, Observer
 from experiments.runs.totals import Totals
+from experiments.runs.watching import Progress, Watch
 from experiments.single_process import SingleProcess, TurnDone
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import load_world
@@ -49,18 +50,6 @@ from shared.statefile import write_atomically
 SNAPSHOT_EVERY_S = 60.0
 
 
-@dataclass(frozen=True)
-class Progress:
-    """How far a run is."""
-
-    run: str
-    done: int
-    of: int
-    unit: Unit
-    fitness: float
-    """Mean over the last episodes."""
-
-
 class Run:
     """A plan with a seed in a folder.
 
@@ -71,6 +60,7 @@ class Run:
         folder: Folder of this run, to be made or continued.
         predecessor: Folder of the finished run this one goes on from, if the plan has one.
         command: What to run to repeat it.
+        watch: Sees every turn.
 
     Raises:
         ConfigError: The folder belongs to another configuration.
@@ -85,7 +75,9 @@ class Run:
         folder: Path,
         predecessor: Path | None,
         command: str,
+        watch: Watch | None = None,
     ) -> None:
+        self._watch = watch or Watch()
         self.plan, self.folder, self.seed = plan, folder, seed
         self._scale = scale
         self._command, self._started = command, now_utc()
@@ -120,10 +112,12 @@ class Run:
         if not self.plan.stages:
             self._finish()
             return True
+        self._watch.begin(self._loop)
         saved_s = began_s = time.monotonic()
         for done in self._turns():
             self._totals.seconds += time.monotonic() - began_s
             self._record(done)
+            self._watch.turn(self._loop, done)
             self._check_lap()
             over = self._advance(done)
             report(self._progress())

@@ -24,7 +24,8 @@ from rich.progress import Progress as Bars
 
 from experiments.plans.plan import Plan
 from experiments.plans.scales import load_plan
-from experiments.runs.run import Progress, Run
+from experiments.runs.run import Run
+from experiments.runs.watching import Progress
 from shared.errors import CorridorError
 
 OUT = Path("runs") / "experiments"

@@ -12,7 +12,7 @@ from services.cli.options import ConfigOption, SetOption, import_installed, load
 
 def add_to(app: typer.Typer) -> None:
     """Add the commands."""
-    for command in (experiment, report, evaluate):
+    for command in (experiment, retention, report, evaluate):
         app.command()(command)
 
 
@@ -52,6 +52,29 @@ def experiment(
         typer.echo(commands.described(names, scale))
         return
     raise typer.Exit(commands.run(names, scale, seeds, seed, jobs, out))
+
+
+def retention(
+    setting: Annotated[
+        str, typer.Option(help="Which stream: see docs/comparison.md.")
+    ] = "standard",
+    seed: Annotated[
+        list[int] | None, typer.Option(min=1, help="This seed; may be repeated. Default: all.")
+    ] = None,
+    entry: Annotated[
+        list[str] | None, typer.Option(help="This entry; may be repeated. Default: all.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of streams and results; default runs/retention.")
+    ] = None,
+) -> None:
+    """Compare what strategies keep of the same stream: networks learn from it, and drive.
+
+    Run again, it goes on. A stream takes a gigabyte.
+    """
+    command = import_installed("experiments.retention.command", "experiments")
+    console = import_installed("rich.console", "experiments").Console()
+    raise typer.Exit(command.run(setting, seed or [], entry or [], out, console))
 
 
 def report(

@@ -1,0 +1,127 @@
+"""The benchmark of retention as data: settings, entries, seeds, and what each network gets."""
+
+from __future__ import annotations
+
+import tomllib
+from importlib import resources
+from typing import Annotated, Any, NamedTuple, Self
+
+from pydantic import Field, ValidationError, model_validator
+
+from experiments.plans.plan import Plan, merged, stage_config
+from experiments.plans.scales import load_plan
+from shared.config import Config, Name, Section
+from shared.errors import ConfigError
+
+Count = Annotated[int, Field(ge=1)]
+Names = Annotated[tuple[Name, ...], Field(strict=False)]
+FILE = "benchmark.toml"
+
+
+class Setting(Section):
+    """A stream: the plan that is recorded, and how large."""
+
+    name: Name
+    plan: Name
+    scale: Name
+    marks: Names = ()
+    """Stages at whose end a network learns; empty: those of the benchmark."""
+    exploratory: bool = False
+    """Whether all entries manage it, and not the primary ones alone."""
+
+
+class Entry(Section):
+    """A way to manage the memory."""
+
+    name: Name
+    primary: bool = False
+    memory: dict[str, Any]
+    """Settings of the memory that differ from those of the plan."""
+    steps: Annotated[int, Field(ge=0)] = 0
+    """Gradient steps of its networks; 0: those of the benchmark."""
+    networks: Count = 1
+    """How many networks learn from each memory, from weights of their own."""
+
+
+class Benchmark(Section):
+    """Everything that is fixed before the runs."""
+
+    steps: Count
+    averaged_steps: Count
+    marks: Names
+    worlds: Names
+    starts: Count
+    actions: Count
+    primary_seeds: Count
+    exploratory_seeds: Count
+    settings: Annotated[tuple[Setting, ...], Field(strict=False)]
+    entries: Annotated[tuple[Entry, ...], Field(strict=False)]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        for what in (self.settings, self.entries):
+            names = [each.name for each in what]
+            if len(set(names)) < len(names):
+                raise ValueError(f"names must differ, got {names}")
+        return self
+
+    def setting(self, name: str) -> Setting:
+        """Return the setting of this name. Raises ConfigError."""
+        found = next((each for each in self.settings if each.name == name), None)
+        if found is None:
+            known = ", ".join(each.name for each in self.settings)
+            raise ConfigError(f"--setting: expected one of {known}, got {name!r}")
+        return found
+
+    def entries_of(self, setting: Setting, seed: int) -> list[Entry]:
+        """Return the entries that a seed of a setting has, primary ones first."""
+        chosen = [entry for entry in self.entries if self.wanted(entry, setting, seed)]
+        return sorted(chosen, key=lambda entry: not entry.primary)
+
+    def wanted(self, entry: Entry, setting: Setting, seed: int) -> bool:
+        """Whether an entry is measured with this seed of a setting."""
+        if entry.primary:
+            return seed <= self.primary_seeds
+        return setting.exploratory and seed <= self.exploratory_seeds
+
+
+class Work(NamedTuple):
+    """What one entry does with one seed of a setting."""
+
+    setting: Setting
+    entry: Entry
+    seed: int
+
+
+def load_benchmark() -> Benchmark:
+    """Return the benchmark in `benchmark.toml`. Raises ConfigError where it is wrong."""
+    text = resources.files("experiments").joinpath("retention", FILE).read_text("utf-8")
+    return read_benchmark(text)
+
+
+def read_benchmark(text: str) -> Benchmark:
+    """Return the benchmark in the text of a file. Raises ConfigError where it is wrong."""
+    try:
+        found = Benchmark.model_validate(tomllib.loads(text))
+    except (ValidationError, tomllib.TOMLDecodeError) as error:
+        first = error.errors()[0] if isinstance(error, ValidationError) else {"msg": str(error)}
+        where = ".".join(str(part) for part in first.get("loc", ()))
+        raise ConfigError(f"{FILE}: {where}: {first['msg']}") from error
+    for setting in found.settings:
+        plan = load_plan(setting.plan, setting.scale)
+        stages = {stage.name for stage in plan.stages}
+        if unknown := {*(setting.marks or found.marks)} - stages:
+            raise ConfigError(f"{FILE}: {setting.name}: no stages {', '.join(sorted(unknown))}")
+        for entry in found.entries:
+            config_of(plan, entry, seed=1)
+    return found
+
+
+def config_of(plan: Plan, entry: Entry, seed: int) -> Config:
+    """Return the configuration with which an entry manages the stream of a plan.
+
+    Rewards stay as they were observed unless the entry says otherwise. Raises ConfigError.
+    """
+    memory = {"equalise_every": 0, "equalise_every_actions": 0, **entry.memory}
+    own = plan.model_copy(update={"config": merged(plan.config, {"memory": memory})})
+    return stage_config(own, 0, seed)

@@ -1,0 +1,94 @@
+"""What a strategy keeps of a stream, and what keeping it costs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from experiments.retention.stream import Stream
+from shared.config import Config, Numerics
+from shared.facts import SHORT_NAMES
+from shared.rl.memory import ReplayMemory
+from shared.rl.predictor import Predictor
+from shared.rl.retention.strategy import strategy
+from shared.rl.turn import maintain
+
+
+@dataclass
+class Costs:
+    """What a strategy did until now."""
+
+    discards: int = 0
+    removed: int = 0
+    last_resort: int = 0
+    seconds: float = 0.0
+    """Processor time of all discards, refreshes of rewards included."""
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A memory at the end of a stage."""
+
+    stage: str
+    memory: ReplayMemory
+    costs: Costs
+
+
+def managed(
+    stream: Stream, config: Config, numerics: Numerics, ends: Mapping[int, str]
+) -> Iterator[Mark]:
+    """Let a strategy manage a stream; yield the memory at the ends of stages.
+
+    Args:
+        stream: What comes.
+        config: Its `memory` is the strategy; its network and seed are those of the stream.
+        numerics: How descriptors and values are computed.
+        ends: Names of stages by their last episode. The memory goes on to change after each.
+    """
+    memory = ReplayMemory(config.memory.capacity)
+    memory.worlds = list(stream.worlds)
+    network, costs = Predictor(config.network, numerics), Costs()
+    for turn in stream.turns():
+        if turn.version != network.version:
+            network.load(turn.version, stream.weights(turn.version))
+        memory.append(turn.rows, turn.images)
+        began_s = time.process_time()
+        done = maintain(memory, turn.now, config.memory, network, config.run.seed)
+        if len(done.discarded.ids):
+            costs.seconds += time.process_time() - began_s
+            costs.discards += 1
+            costs.removed += len(done.discarded.ids)
+            costs.last_resort += done.discarded.told["last_resort"]
+        if stage := ends.get(turn.now.episode):
+            yield Mark(stage, memory, costs)
+
+
+def figures(mark: Mark, config: Config) -> dict[str, float]:
+    """Return what a memory holds and what it has cost, by name.
+
+    Returns:
+        share_<world>, share_<action>: parts of the samples.
+        age: mean age in memories: 1 is a sample that came N samples ago.
+        last_resort: part of what was removed that went by age for want of candidates.
+        discard_ms: mean processor time of a discard.
+        column_bytes: bytes a sample that the strategy adds.
+    """
+    memory, costs = mark.memory, mark.costs
+    rows, count = memory.rows, len(memory)
+    worlds = np.bincount(rows["world"], minlength=len(memory.worlds)) / count
+    actions = np.array(memory.by_action()) / count
+    newest = int(memory.ids[-1])
+    ages = (newest - rows["id"].astype(np.int64)) / memory.capacity
+    own = np.dtype([("id", "<u8"), *strategy(config.memory.strategy).columns])
+    return {
+        "samples": count,
+        **{f"share_{name}": float(s) for name, s in zip(memory.worlds, worlds, strict=True)},
+        **{f"share_{name}": float(s) for name, s in zip(SHORT_NAMES, actions, strict=True)},
+        "age": float(ages.mean()),
+        "last_resort": costs.last_resort / max(costs.removed, 1),
+        "discard_ms": 1000.0 * costs.seconds / max(costs.discards, 1),
+        "column_bytes": own.itemsize - 8,
+    }

@@ -1,0 +1,171 @@
+"""The benchmark's work: record streams, let entries manage them, let networks learn and drive.
+
+    <out>/streams/<setting>/<plan>-<scale>/seed-<n>/   the run that recorded it
+    <out>/streams/<setting>/stream-<n>/                the stream, some gigabytes at N = 4,500
+    <out>/measured/<setting>/<entry>-<seed>.json       a `Measured`
+
+Run again, it goes on: what is measured is left alone, and a recording continues.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import get_args
+
+from pydantic import BaseModel, ConfigDict
+
+from experiments.plans.plan import Plan, stage_config
+from experiments.plans.scales import load_plan
+from experiments.retention.benchmark import Benchmark, Entry, Setting, Work, config_of
+from experiments.retention.contents import Mark, figures, managed
+from experiments.retention.stream import Recorder, Stream
+from experiments.retention.worth import driven, learned
+from experiments.runs.run import Run
+from shared.config import Config
+from shared.numerics import Role, settle
+from shared.provenance import machine_key
+from shared.run_record import RUN, RunInfo, made_here
+from shared.statefile import write_atomically
+
+Tell = Callable[[str], None]
+
+
+class Network(BaseModel):
+    """What one network made of one memory."""
+
+    model_config = ConfigDict(frozen=True)
+    mark: str
+    """The stage at whose end the memory was taken."""
+    number: int
+    """Which of the networks of this memory."""
+    contents: dict[str, float]
+    drives: dict[str, dict[str, float]]
+    """Figures of frozen drives by world."""
+
+
+class Measured(BaseModel):
+    """An entry with one seed of a setting."""
+
+    model_config = ConfigDict(frozen=True)
+    setting: str
+    entry: str
+    seed: int
+    networks: tuple[Network, ...]
+    seconds: float
+    commit: str
+    machine: str
+
+
+def measure(
+    benchmark: Benchmark, work: Sequence[Work], out: Path, tell: Tell, stopped: Callable[[], bool]
+) -> bool:
+    """Do everything of `work` that is not done yet; return whether all of it is.
+
+    Raises:
+        CorridorError: A stream cannot be recorded or read.
+    """
+    for piece in work:
+        path = measured_path(out, piece)
+        if path.exists():
+            continue
+        if stopped():
+            return False
+        label = f"{piece.setting.name}, seed {piece.seed}"
+        stream = _recorded(piece.setting, piece.seed, out, tell, stopped)
+        if stream is None:
+            return False
+        tell(f"{label}: {piece.entry.name}")
+        write_atomically(path, _measured(benchmark, piece, stream, out).model_dump_json().encode())
+    return True
+
+
+def measured_path(out: Path, work: Work) -> Path:
+    """Where the result of a piece of work lies."""
+    return out / "measured" / work.setting.name / f"{work.entry.name}-{work.seed}.json"
+
+
+def _recorded(
+    setting: Setting, seed: int, out: Path, tell: Tell, stopped: Callable[[], bool]
+) -> Stream | None:
+    """The stream of a setting, recorded first where it is missing; None if that was stopped."""
+    plan = load_plan(setting.plan, setting.scale)
+    base = out / "streams" / setting.name
+    folder = base / f"stream-{seed}"
+    run_folder = _run_folder(setting, seed, out)
+    command = f"corridor retention --setting {setting.name} --seed {seed}"
+    run = Run(plan, setting.scale, seed, run_folder, None, command, Recorder(folder))
+    try:
+        if not run.complete:
+            tell(f"{setting.name}, seed {seed}: recording the stream")
+        if not run.go(lambda _: None, stopped):
+            return None
+    finally:
+        run.close()
+    return Stream(folder)
+
+
+def _run_folder(setting: Setting, seed: int, out: Path) -> Path:
+    run = f"{setting.plan}-{setting.scale}"
+    return out / "streams" / setting.name / run / f"seed-{seed}"
+
+
+def _measured(benchmark: Benchmark, work: Work, stream: Stream, out: Path) -> Measured:
+    """Manage the stream, and let networks learn at every mark."""
+    began_s = time.monotonic()
+    setting, entry, seed = work
+    plan = load_plan(setting.plan, setting.scale)
+    config = _settled(config_of(plan, entry, seed), plan, seed, out)
+    info = RunInfo.model_validate_json((_run_folder(setting, seed, out) / RUN).read_bytes())
+    marks = setting.marks or benchmark.marks
+    ends = {
+        stage.last_episode: stage.name
+        for stage in info.stages
+        if stage.last_episode is not None and stage.name in marks
+    }
+    networks = [
+        network
+        for mark in managed(stream, config, config.numerics.replay, ends)
+        for network in _networks(benchmark, entry, mark, config)
+    ]
+    made = made_here()
+    return Measured(
+        setting=setting.name,
+        entry=entry.name,
+        seed=seed,
+        networks=tuple(networks),
+        seconds=round(time.monotonic() - began_s, 1),
+        commit=str(made["commit"]),
+        machine=str(made["machine"]),
+    )
+
+
+def _networks(benchmark: Benchmark, entry: Entry, mark: Mark, config: Config) -> list[Network]:
+    """Networks that learn from a memory and drive."""
+    held = {name: round(value, 5) for name, value in figures(mark, config).items()}
+    found = []
+    for number in range(1, entry.networks + 1):
+        weights = learned(
+            mark.memory,
+            config,
+            config.numerics.learner,
+            seed=1000 * number + config.run.seed,
+            steps=entry.steps or benchmark.steps,
+            averaged=benchmark.averaged_steps,
+        )
+        drives = driven(weights, config, benchmark.worlds, benchmark.starts, benchmark.actions)
+        told = {
+            world: {name: round(float(value), 5) for name, value in of_world.items()}
+            for world, of_world in drives.items()
+        }
+        found.append(Network(mark=mark.stage, number=number, contents=held, drives=told))
+    return found
+
+
+def _settled(config: Config, plan: Plan, seed: int, out: Path) -> Config:
+    """The configuration with numerics that all entries share on this machine."""
+    common = out / "machines" / machine_key(stage_config(plan, 0, seed))
+    roles = {role: settle(config, common, role) for role in get_args(Role)}
+    numerics = config.numerics.model_copy(update=roles)
+    return config.model_copy(update={"numerics": numerics})

@@ -1,0 +1,186 @@
+"""Streams, what strategies keep of them, and what networks learn from that, on a tiny plan."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.plans.plan import Plan, read_plan, stage_config
+from experiments.retention import benchmark as benchmark_module
+from experiments.retention import work
+from experiments.retention.benchmark import Benchmark, Work, config_of, read_benchmark
+from experiments.retention.contents import managed
+from experiments.retention.stream import Recorder, Stream
+from experiments.retention.work import Measured
+from experiments.runs.run import Run
+from shared.errors import StateError
+
+pytestmark = pytest.mark.timeout(300)
+
+PLAN = """
+title = "t"
+source = "s"
+counted_in = "actions"
+episode_actions = 20
+[config]
+network = { filters = 4 }
+memory = { capacity = 60, strategy = "normm", equalise_every = 0 }
+learning = { batch_size = 16, mini_batches_per_episode = 0, fit_every_actions = 60, fit_epochs = 1 }
+[config.numerics]
+actor = { engine = "torch", precision = "float32" }
+replay = { device = "cpu", engine = "torch", threads = 1, precision = "float32" }
+learner = { device = "cpu", threads = 1, precision = "float32" }
+[[stages]]
+name = "plus"
+until = 100
+[[stages]]
+name = "minus"
+until = 220
+[stages.config.robot]
+world = "minus"
+[evaluation]
+starts = 1
+actions = 50
+every_actions = 1000000
+every_starts = 1
+every_length = 50
+"""
+BENCHMARK = """
+steps = 6
+averaged_steps = 2
+marks = ["plus", "minus"]
+worlds = ["plus"]
+starts = 2
+actions = 50
+primary_seeds = 2
+exploratory_seeds = 1
+[[settings]]
+name = "tiny"
+plan = "stream"
+scale = "full"
+exploratory = true
+[[entries]]
+name = "normm"
+primary = true
+memory = { strategy = "normm" }
+[[entries]]
+name = "rmm"
+memory = { strategy = "rmm", equalise_every_actions = 70 }
+networks = 2
+"""
+
+
+@pytest.fixture
+def tiny(monkeypatch: pytest.MonkeyPatch) -> Plan:
+    """The plan, in place of the one that is recorded."""
+    plan = read_plan("stream", PLAN)
+    for module in (work, benchmark_module):
+        monkeypatch.setattr(module, "load_plan", lambda *_: plan)
+    return plan
+
+
+def recorded(plan: Plan, folder: Path, *stops: int) -> Run:
+    """A run with its stream, stopped after so many turns each time."""
+    for turns in (*stops, 10**9):
+        seen: list[object] = []
+        run = Run(plan, "full", 1, folder / "x" / "run", None, "c", Recorder(folder / "stream"))
+        run.go(seen.append, lambda seen=seen, turns=turns: len(seen) >= turns)
+        run.close()
+    return run
+
+
+def test_a_stream_gives_the_run_that_it_was_recorded_from(tiny: Plan, tmp_path: Path) -> None:
+    """What the run's own strategy keeps of it is what the run kept, to the last bit."""
+    recorded(tiny, tmp_path)
+    stream, config = Stream(tmp_path / "stream"), stage_config(tiny, 0, 1)
+    with np.load(tmp_path / "x" / "run" / "state-end" / "memory.npz") as file:
+        rows, images = file["rows"], file["images"]
+    last = int(json.loads((tmp_path / "x" / "run" / "run.json").read_text())["episodes"])
+    (mark,) = managed(stream, config, config.numerics.replay, {last: "minus"})
+    found = mark.memory.rows.copy()
+    for name in set(rows.dtype.names or ()) - {"slot"}:
+        np.testing.assert_array_equal(found[name], rows[name], err_msg=name)
+    np.testing.assert_array_equal(mark.memory.images(np.arange(len(found))), images)
+    assert mark.memory.worlds == ["plus", "minus"]
+    assert mark.costs.removed == len(stream.samples) - len(found)
+
+
+def test_a_recording_that_was_stopped_goes_on(tiny: Plan, tmp_path: Path) -> None:
+    recorded(tiny, tmp_path / "whole")
+    recorded(tiny, tmp_path / "parted", 2, 5, 3)
+    for path in sorted((tmp_path / "whole" / "stream").rglob("*.*")):
+        other = tmp_path / "parted" / path.relative_to(tmp_path / "whole")
+        assert other.read_bytes() == path.read_bytes(), path.name
+
+
+def test_what_was_written_after_the_last_snapshot_is_cut_off(tiny: Plan, tmp_path: Path) -> None:
+    recorded(tiny, tmp_path / "whole")
+    seen: list[object] = []
+    folder = tmp_path / "parted"
+    one = Run(tiny, "full", 1, folder / "x" / "run", None, "c", Recorder(folder / "stream"))
+    one.go(seen.append, lambda: len(seen) >= 4)
+    one.close()
+    for name in ("samples.bin", "images.bin", "turns.bin"):
+        with (folder / "stream" / name).open("ab") as file:
+            file.write(b"begun")
+    recorded(tiny, folder)
+    whole, parted = Stream(tmp_path / "whole" / "stream"), Stream(folder / "stream")
+    assert parted.samples.tobytes() == whole.samples.tobytes()
+    assert parted.images.tobytes() == whole.images.tobytes()
+
+
+def test_a_damaged_stream_is_refused(tiny: Plan, tmp_path: Path) -> None:
+    recorded(tiny, tmp_path)
+    path = tmp_path / "stream" / "samples.bin"
+    path.write_bytes(path.read_bytes()[:-60])
+    with pytest.raises(StateError, match="damaged stream"):
+        Stream(tmp_path / "stream")
+
+
+def test_everything_is_measured_once(tiny: Plan, tmp_path: Path) -> None:
+    benchmark = read_benchmark(BENCHMARK)
+    setting = benchmark.setting("tiny")
+    every = [Work(setting, entry, 1) for entry in benchmark.entries_of(setting, 1)]
+    told: list[str] = []
+    assert work.measure(benchmark, every, tmp_path, told.append, lambda: False)
+    assert told == [
+        "tiny, seed 1: recording the stream", "tiny, seed 1: normm", "tiny, seed 1: rmm",
+    ]  # fmt: skip
+    assert work.measure(benchmark, every, tmp_path, told.append, lambda: True)  # all is done
+    assert len(told) == 3
+    paths = [work.measured_path(tmp_path, piece) for piece in every]
+    one, other = (Measured.model_validate_json(path.read_bytes()) for path in paths)
+    assert [(n.mark, n.number) for n in one.networks] == [("plus", 1), ("minus", 1)]
+    assert [(n.mark, n.number) for n in other.networks] == [
+        ("plus", 1), ("plus", 2), ("minus", 1), ("minus", 2),
+    ]  # fmt: skip
+    drives = [network.drives["plus"] for network in other.networks]
+    assert all(drive["actions"] == 100 for drive in drives)
+    held = one.networks[1].contents
+    assert held["samples"] <= 60
+    assert held["share_plus"] + held["share_minus"] == pytest.approx(1.0, abs=1e-4)
+    assert held["column_bytes"] == 0 < other.networks[0].contents["column_bytes"]
+
+
+def test_a_stopped_recording_measures_nothing(tiny: Plan, tmp_path: Path) -> None:
+    benchmark = read_benchmark(BENCHMARK)
+    setting = benchmark.setting("tiny")
+    every = [Work(setting, entry, 1) for entry in benchmark.entries_of(setting, 1)]
+    calls: list[int] = []
+
+    def after_the_third() -> bool:
+        calls.append(1)
+        return len(calls) > 3
+
+    assert not work.measure(benchmark, every, tmp_path, lambda _: None, after_the_third)
+    assert not (tmp_path / "measured").exists()
+
+
+def test_rewards_stay_as_observed_unless_an_entry_refreshes_them(tiny: Plan) -> None:
+    benchmark: Benchmark = read_benchmark(BENCHMARK)
+    kept, refreshed = (config_of(tiny, entry, 1).memory for entry in benchmark.entries)
+    assert (kept.equalise_every, kept.equalise_every_actions) == (0, 0)
+    assert refreshed.equalise_every_actions == 70
