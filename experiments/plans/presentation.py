@@ -33,12 +33,13 @@ class Expected(Section):
 class Comparison(Section):
     """A comparison with other experiments. It is shown where all of them were run."""
 
-    kind: Literal["continued", "fitness", "equal-actions", "predictions", "kept"]
+    kind: Literal["continued", "fitness", "equal-actions", "predictions", "kept", "ratios"]
     """continued: fitness of another experiment and of this one, which goes on from it.
     fitness: fitness of all, each from its own first episode.
     equal-actions: bumps beside each other one, after equally many actions of learning.
     predictions: rewards predicted for the same images by this network and another one.
-    kept: mean way without a bump in `world` before and after learning in other corridors."""
+    kept: mean way between bumps in `world` before and after learning in other corridors.
+    ratios: bumps beside each other one at the end of every stage, in all corridors, by seed."""
     others: Names = ()
     world: Name = "plus"
     weights: Literal["best", "last"] = "best"
@@ -60,6 +61,7 @@ _OTHERS = {
     "equal-actions": (1, 20),
     "predictions": (1, 1),
     "kept": (0, 0),
+    "ratios": (1, 10),
 }
 """Least and most other experiments by kind of comparison."""
 

@@ -298,6 +298,6 @@ def kept_share(found: Sequence[Kept], world: str) -> list[str]:
     shares = np.array([entry.share for entry in found])
     word = "at least half" if float(np.median(shares)) >= 0.5 else "less than half"
     return [
-        f"The network kept {spread(100 * shares)} % of its mean way without a bump in {world}, "
+        f"The network kept {spread(100 * shares)} % of its mean way between bumps in {world}, "
         f"{word}."
     ]

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import dropwhile, takewhile
 
 import numpy as np
 
+from experiments.drives.traces import FULL_RUN
 from experiments.report.figures.drives import Compared, laps
 from experiments.report.figures.progress import curve_of
 from experiments.report.run_folder import Experiment, Floats, Rows, RunFolder
@@ -196,7 +198,7 @@ def difference_at_equal_actions(
 
 @dataclass(frozen=True)
 class Kept:
-    """Mean bump-free run in a world before and after learning another one."""
+    """Mean way between two bumps in a world before and after learning another one, in actions."""
 
     seed: int
     before: float
@@ -209,30 +211,37 @@ class Kept:
 
 
 def kept(run: RunFolder, world: str, start: RunFolder | None) -> Kept | None:
-    """How much of one world is left after the stages in others that a run begins with.
+    """How much of one world is left after the first stages in others.
 
     Args:
-        run: Begins in another world.
+        run: It learned elsewhere for one stage or more.
         world: The one it could drive in before.
-        start: The run it goes on from, looked at if `run` did not drive before its first episode.
+        start: The run it goes on from, looked at if `run` did not drive before those stages.
 
     Returns:
         None where one of the two drives is missing.
     """
     stages = run.info.stages
-    away = [stage for stage in stages if stage.world != world]
-    if not away or away[-1].last_episode is None or stages[0].world == world:
+    away = list(
+        takewhile(lambda s: s.world != world, dropwhile(lambda s: s.world == world, stages))
+    )
+    if not away or away[-1].last_episode is None:
         return None
-    first, last = stages[0].first_episode, away[-1].last_episode
+    first, last = away[0].first_episode, away[-1].last_episode
     rows = run.evaluated(world)
-    episodes, means = rows.numbers("episode"), rows.numbers("mean_run")
-    before = means[episodes < first]
+    episodes, ways = rows.numbers("episode"), ways_between_bumps(rows)
+    before = ways[episodes < first]
     if not len(before) and start is not None:
-        before = newest(start, world).numbers("mean_run")
-    after = means[(episodes >= first) & (episodes <= last)]
+        before = ways_between_bumps(newest(start, world))
+    after = ways[(episodes >= first) & (episodes <= last)]
     if not len(before) or not len(after):
         return None
     return Kept(run.info.seed, float(before[-1]), float(after[-1]))
+
+
+def ways_between_bumps(drives: Rows) -> Floats:
+    """Actions for each bump of frozen drives, at most 500 as in the fitness (A37)."""
+    return np.minimum(FULL_RUN, drives.numbers("actions") / np.maximum(drives.numbers("bumps"), 1))
 
 
 def number(value: float) -> str:

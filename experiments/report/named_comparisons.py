@@ -17,6 +17,7 @@ from experiments.report.measures import (
     kept,
     number,
 )
+from experiments.report.ratios import ratio_table, ratios, stage_drives, told
 from experiments.report.run_folder import Experiment
 
 PROBES_SHOWN = 6
@@ -159,7 +160,7 @@ def _weights(experiment: Experiment, world: str, wanted: str) -> probes.Choice |
 def _kept(company: Company, ours: Experiment, named: Comparison) -> list[Block]:
     """What is left of one corridor after learning others."""
     world = named.world
-    title = f"Kept of {world} by {ours.name}: mean actions without a bump, frozen in {world}"
+    title = f"Kept of {world} by {ours.name}: mean way between bumps, frozen in {world}"
     before = company.experiments.get(ours.first.after)
     starts = {run.info.seed: run for run in before.runs} if before is not None else {}
     told = (kept(run, world, starts.get(run.info.seed)) for run in ours.runs)
@@ -176,10 +177,34 @@ def _kept(company: Company, ours: Experiment, named: Comparison) -> list[Block]:
     return [table, Findings(tuple(findings.kept_share(found, world)))]
 
 
+def _ratios(company: Company, ours: Experiment, named: Comparison) -> list[Block]:
+    """Bumps at the end of every stage divided by those of each other experiment, by seed."""
+    blocks: list[Block] = []
+    others = [name for name in named.others if name in company.experiments]
+    members = [ours, *(company.experiments[name] for name in others)]
+    for stage in ours.first.stages:
+        found = [
+            ratio
+            for world in ours.worlds
+            for ratio in ratios(
+                ours.name,
+                others,
+                world,
+                {member.name: stage_drives(member, stage.name, world) for member in members},
+            )
+        ]
+        if found:
+            title = f"Bumps at the end of {stage.name} beside {', '.join(others)}"
+            name = f"{ours.full_name}-ratios-{stage.name}"
+            blocks += [ratio_table(name, title, found), Findings(tuple(told(found)))]
+    return blocks or [Missing(f"ratios of bumps of {ours.name}", "fewer than two common seeds")]
+
+
 _KINDS: Mapping[str, Callable[[Company, Experiment, Comparison], list[Block]]] = {
     "continued": _continued,
     "fitness": _fitness,
     "equal-actions": _equal_actions,
     "predictions": _predictions,
     "kept": _kept,
+    "ratios": _ratios,
 }

@@ -21,6 +21,7 @@ import typer
 from experiments.report import archives
 from experiments.report.document import Block, Findings, Picture, Section, Table, block_text
 from experiments.report.full_report import all_sections
+from experiments.retention.report import kept_section
 from shared.errors import CorridorError, StateError
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -52,7 +53,8 @@ def results_page(docs: Path) -> tuple[str, list[Picture]]:
     """
     source = docs / "results" / "page.template"
     kept = sorted((docs / "results").glob(f"*{archives.SUFFIX}"))
-    named = _named_blocks(all_sections(archives.load(kept)))
+    sections = [*all_sections(archives.load(kept)), *kept_section(docs / "results")]
+    named = _named_blocks(sections)
     pictures: list[Picture] = []
 
     def shown(match: re.Match[str]) -> str:

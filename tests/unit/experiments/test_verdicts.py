@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from experiments.report.verdicts import (
+from experiments.verdicts import (
     FLIPS,
     Paired,
     holm,
