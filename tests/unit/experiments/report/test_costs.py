@@ -12,8 +12,8 @@ from experiments.plans.plan import Plan, stage_config
 from experiments.plans.scales import load_plan
 from experiments.report import archives, costs
 from experiments.report.document import Missing, Table
-from experiments.report.results import DOCS
 from experiments.report.run_folder import Experiment, load
+from experiments.results import DOCS
 from tests.synthetic_runs import write_run
 
 ACTION_S, STEP_S = 0.002, 0.5

@@ -9,7 +9,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from experiments.report import archives, results
+from experiments import results
+from experiments.report import archives
 from shared.errors import StateError
 from tests.synthetic_runs import write_run
 
