@@ -10,6 +10,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from experiments.plans.plan import Plan, merged, stage_config
 from experiments.plans.scales import load_plan
+from experiments.retention.refresh import Way
 from shared.config import Config, Name, Section
 from shared.errors import ConfigError
 
@@ -37,6 +38,10 @@ class Entry(Section):
     primary: bool = False
     memory: dict[str, Any]
     """Settings of the memory that differ from those of the plan."""
+    refresh: Way = "none"
+    """How rewards are refreshed."""
+    refresh_every: Annotated[float, Field(ge=0.0)] = 0.0
+    """How often, in multiples of N actions; 0: never."""
     steps: Annotated[int, Field(ge=0)] = 0
     """Gradient steps of its networks; 0: those of the benchmark."""
     networks: Count = 1
@@ -120,8 +125,8 @@ def read_benchmark(text: str) -> Benchmark:
 def config_of(plan: Plan, entry: Entry, seed: int) -> Config:
     """Return the configuration with which an entry manages the stream of a plan.
 
-    Rewards stay as they were observed unless the entry says otherwise. Raises ConfigError.
+    Eq 3.5 is left to `refresh`. Raises ConfigError.
     """
-    memory = {"equalise_every": 0, "equalise_every_actions": 0, **entry.memory}
+    memory = {**entry.memory, "equalise_every": 0, "equalise_every_actions": 0}
     own = plan.model_copy(update={"config": merged(plan.config, {"memory": memory})})
     return stage_config(own, 0, seed)

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from experiments.retention.refresh import Refresher
 from experiments.retention.stream import Stream
 from shared.config import Config, Numerics
 from shared.facts import SHORT_NAMES
 from shared.rl.memory import ReplayMemory
 from shared.rl.predictor import Predictor
 from shared.rl.retention.strategy import strategy
+from shared.rl.schedule import due
 from shared.rl.turn import maintain
 
 
@@ -25,7 +27,7 @@ class Costs:
     removed: int = 0
     last_resort: int = 0
     seconds: float = 0.0
-    """Processor time of all discards, refreshes of rewards included."""
+    """Processor time of all discards."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,12 @@ class Mark:
 
 
 def managed(
-    stream: Stream, config: Config, numerics: Numerics, ends: Mapping[int, str]
+    stream: Stream,
+    config: Config,
+    numerics: Numerics,
+    ends: Mapping[int, str],
+    refresher: Refresher,
+    refresh_every: int,
 ) -> Iterator[Mark]:
     """Let a strategy manage a stream; yield the memory at the ends of stages.
 
@@ -47,6 +54,8 @@ def managed(
         config: Its `memory` is the strategy; its network and seed are those of the stream.
         numerics: How descriptors and values are computed.
         ends: Names of stages by their last episode. The memory goes on to change after each.
+        refresher: How rewards are refreshed.
+        refresh_every: Actions between two times; 0: never.
     """
     memory = ReplayMemory(config.memory.capacity)
     memory.worlds = list(stream.worlds)
@@ -54,6 +63,8 @@ def managed(
     for turn in stream.turns():
         if turn.version != network.version:
             network.load(turn.version, stream.weights(turn.version))
+        if len(turn.rows):
+            refresher.note(int(turn.rows["id"][0]) - 1, len(turn.rows), network)
         memory.append(turn.rows, turn.images)
         began_s = time.process_time()
         done = maintain(memory, turn.now, config.memory, network, config.run.seed)
@@ -62,6 +73,8 @@ def managed(
             costs.discards += 1
             costs.removed += len(done.discarded.ids)
             costs.last_resort += done.discarded.told["last_resort"]
+        if due(turn.now, 0, refresh_every):
+            refresher.refresh(memory, network)
         if stage := ends.get(turn.now.episode):
             yield Mark(stage, memory, costs)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,10 +15,13 @@ from experiments.retention import benchmark as benchmark_module
 from experiments.retention import work
 from experiments.retention.benchmark import Benchmark, Work, config_of, read_benchmark
 from experiments.retention.contents import managed
+from experiments.retention.refresh import Refresher, Way
 from experiments.retention.stream import Recorder, Stream
 from experiments.retention.work import Measured
 from experiments.runs.run import Run
 from shared.errors import StateError
+from shared.rl.memory import ReplayMemory
+from shared.rl.predictor import Predictor
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -68,18 +73,36 @@ primary = true
 memory = { strategy = "normm" }
 [[entries]]
 name = "rmm"
-memory = { strategy = "rmm", equalise_every_actions = 70 }
+memory = { strategy = "rmm" }
 networks = 2
+refresh = "blend"
+refresh_every = 1.2
 """
 
 
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> Plan:
     """The plan, in place of the one that is recorded."""
-    plan = read_plan("stream", PLAN)
     for module in (work, benchmark_module):
-        monkeypatch.setattr(module, "load_plan", lambda *_: plan)
-    return plan
+        monkeypatch.setattr(module, "load_plan", lambda *_: TINY)
+    return TINY
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording in one go."""
+    folder = tmp_path_factory.mktemp("whole")
+    recorded(TINY, folder)
+    return folder
+
+
+def with_references(whole: Path, folder: Path) -> Path:
+    """The folder with the drives of chance and planner, which take longest."""
+    shutil.copytree(whole / "references", folder / "references")
+    return folder
+
+
+TINY = read_plan("stream", PLAN)
 
 
 def recorded(plan: Plan, folder: Path, *stops: int) -> Run:
@@ -92,14 +115,14 @@ def recorded(plan: Plan, folder: Path, *stops: int) -> Run:
     return run
 
 
-def test_a_stream_gives_the_run_that_it_was_recorded_from(tiny: Plan, tmp_path: Path) -> None:
+def test_a_stream_gives_the_run_that_it_was_recorded_from(whole: Path) -> None:
     """What the run's own strategy keeps of it is what the run kept, to the last bit."""
-    recorded(tiny, tmp_path)
-    stream, config = Stream(tmp_path / "stream"), stage_config(tiny, 0, 1)
-    with np.load(tmp_path / "x" / "run" / "state-end" / "memory.npz") as file:
+    stream, config = Stream(whole / "stream"), stage_config(TINY, 0, 1)
+    with np.load(whole / "x" / "run" / "state-end" / "memory.npz") as file:
         rows, images = file["rows"], file["images"]
-    last = int(json.loads((tmp_path / "x" / "run" / "run.json").read_text())["episodes"])
-    (mark,) = managed(stream, config, config.numerics.replay, {last: "minus"})
+    last = int(json.loads((whole / "x" / "run" / "run.json").read_text())["episodes"])
+    refresher = Refresher("none", stream, config, {})
+    (mark,) = managed(stream, config, config.numerics.replay, {last: "minus"}, refresher, 0)
     found = mark.memory.rows.copy()
     for name in set(rows.dtype.names or ()) - {"slot"}:
         np.testing.assert_array_equal(found[name], rows[name], err_msg=name)
@@ -108,39 +131,39 @@ def test_a_stream_gives_the_run_that_it_was_recorded_from(tiny: Plan, tmp_path: 
     assert mark.costs.removed == len(stream.samples) - len(found)
 
 
-def test_a_recording_that_was_stopped_goes_on(tiny: Plan, tmp_path: Path) -> None:
-    recorded(tiny, tmp_path / "whole")
-    recorded(tiny, tmp_path / "parted", 2, 5, 3)
-    for path in sorted((tmp_path / "whole" / "stream").rglob("*.*")):
-        other = tmp_path / "parted" / path.relative_to(tmp_path / "whole")
+def test_a_recording_that_was_stopped_goes_on(whole: Path, tmp_path: Path) -> None:
+    recorded(TINY, with_references(whole, tmp_path), 2, 5, 3)
+    for path in sorted((whole / "stream").rglob("*.*")):
+        other = tmp_path / path.relative_to(whole)
         assert other.read_bytes() == path.read_bytes(), path.name
 
 
-def test_what_was_written_after_the_last_snapshot_is_cut_off(tiny: Plan, tmp_path: Path) -> None:
-    recorded(tiny, tmp_path / "whole")
+def test_what_was_written_after_the_last_snapshot_is_cut_off(whole: Path, tmp_path: Path) -> None:
     seen: list[object] = []
-    folder = tmp_path / "parted"
-    one = Run(tiny, "full", 1, folder / "x" / "run", None, "c", Recorder(folder / "stream"))
+    folder = with_references(whole, tmp_path)
+    one = Run(TINY, "full", 1, folder / "x" / "run", None, "c", Recorder(folder / "stream"))
     one.go(seen.append, lambda: len(seen) >= 4)
     one.close()
     for name in ("samples.bin", "images.bin", "turns.bin"):
         with (folder / "stream" / name).open("ab") as file:
             file.write(b"begun")
-    recorded(tiny, folder)
-    whole, parted = Stream(tmp_path / "whole" / "stream"), Stream(folder / "stream")
-    assert parted.samples.tobytes() == whole.samples.tobytes()
-    assert parted.images.tobytes() == whole.images.tobytes()
+    recorded(TINY, folder)
+    expected, parted = Stream(whole / "stream"), Stream(folder / "stream")
+    assert parted.samples.tobytes() == expected.samples.tobytes()
+    assert parted.images.tobytes() == expected.images.tobytes()
 
 
-def test_a_damaged_stream_is_refused(tiny: Plan, tmp_path: Path) -> None:
-    recorded(tiny, tmp_path)
+def test_a_damaged_stream_is_refused(whole: Path, tmp_path: Path) -> None:
+    shutil.copytree(whole / "stream", tmp_path / "stream")
     path = tmp_path / "stream" / "samples.bin"
     path.write_bytes(path.read_bytes()[:-60])
     with pytest.raises(StateError, match="damaged stream"):
         Stream(tmp_path / "stream")
 
 
-def test_everything_is_measured_once(tiny: Plan, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("tiny")
+def test_everything_is_measured_once(whole: Path, tmp_path: Path) -> None:
+    with_references(whole, tmp_path / "streams" / "tiny")
     benchmark = read_benchmark(BENCHMARK)
     setting = benchmark.setting("tiny")
     every = [Work(setting, entry, 1) for entry in benchmark.entries_of(setting, 1)]
@@ -165,7 +188,8 @@ def test_everything_is_measured_once(tiny: Plan, tmp_path: Path) -> None:
     assert held["column_bytes"] == 0 < other.networks[0].contents["column_bytes"]
 
 
-def test_a_stopped_recording_measures_nothing(tiny: Plan, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("tiny")
+def test_a_stopped_recording_measures_nothing(tmp_path: Path) -> None:
     benchmark = read_benchmark(BENCHMARK)
     setting = benchmark.setting("tiny")
     every = [Work(setting, entry, 1) for entry in benchmark.entries_of(setting, 1)]
@@ -179,8 +203,75 @@ def test_a_stopped_recording_measures_nothing(tiny: Plan, tmp_path: Path) -> Non
     assert not (tmp_path / "measured").exists()
 
 
-def test_rewards_stay_as_observed_unless_an_entry_refreshes_them(tiny: Plan) -> None:
+def test_the_memory_itself_refreshes_nothing(tiny: Plan) -> None:
+    """That is left to the ways of the benchmark."""
     benchmark: Benchmark = read_benchmark(BENCHMARK)
-    kept, refreshed = (config_of(tiny, entry, 1).memory for entry in benchmark.entries)
-    assert (kept.equalise_every, kept.equalise_every_actions) == (0, 0)
-    assert refreshed.equalise_every_actions == 70
+    for entry in benchmark.entries:
+        memory = config_of(tiny, entry, 1).memory
+        assert (memory.equalise_every, memory.equalise_every_actions) == (0, 0)
+
+
+def refreshed(whole: Path, way: Way, losses: dict[int, float], times: int = 1) -> Any:
+    """The first samples of a stream, refreshed with its last network: rows before and after."""
+    stream, config = Stream(whole / "stream"), stage_config(TINY, 0, 1)
+    network = Predictor(config.network, config.numerics.replay)
+    refresher, memory = Refresher(way, stream, config, losses), ReplayMemory(200)
+    memory.worlds = stream.worlds
+    for turn in stream.turns():
+        if turn.version != network.version:
+            network.load(turn.version, stream.weights(turn.version))
+        refresher.note(int(turn.rows["id"][0]) - 1, len(turn.rows), network)
+        memory.append(turn.rows, turn.images)
+    before = memory.rows.copy()
+    for _ in range(times):
+        refresher.refresh(memory, network)
+    return before, memory.rows, memory, network, refresher
+
+
+def test_ways_of_refreshing_are_what_they_say(whole: Path) -> None:
+    before, none, *_ = refreshed(whole, "none", {})
+    np.testing.assert_array_equal(none["reward"], before["reward"])
+    before, blend, memory, network, _ = refreshed(whole, "blend", {})
+    images = memory.images(np.arange(len(memory)))
+    q = np.array(
+        [network.values(i[None], a[None])[0] for i, a in zip(images, before["action"], strict=True)]
+    )
+    once = 0.7 * before["reward"] + 0.3 * q
+    np.testing.assert_allclose(blend["reward"], np.clip(once, -1, 1), atol=1e-6)
+    _, twice, *_ = refreshed(whole, "blend", {}, times=2)
+    np.testing.assert_allclose(twice["reward"], np.clip(0.7 * once + 0.3 * q, -1, 1), atol=1e-6)
+    _, anchored, *_ = refreshed(whole, "anchored", {}, times=2)
+    np.testing.assert_allclose(anchored["reward"], np.clip(once, -1, 1), atol=1e-6)
+    _, protected, *_ = refreshed(whole, "protected", {})
+    terminal = before["reward"] == -1.0
+    assert terminal.any()
+    assert (protected["reward"][terminal] == -1.0).all()
+    np.testing.assert_array_equal(protected["reward"][~terminal], blend["reward"][~terminal])
+
+
+def test_only_the_next_value_is_made_anew(whole: Path) -> None:
+    before, after, memory, network, _ = refreshed(whole, "next-value", {})
+    terminal = before["reward"] == -1.0
+    assert (after["reward"][terminal] == -1.0).all()
+    images = memory.images(np.arange(len(memory)))
+    changed = 0
+    for i in np.flatnonzero(after["reward"] != before["reward"]):
+        assert not terminal[i]
+        now = network.all_values(images[i + 1][None]).max()
+        rest = before["reward"][i] - after["reward"][i] + 0.2 * now
+        assert -0.2 - 1e-5 <= rest <= 0.2 + 1e-5  # 0.2 max Q, as it was then
+        changed += 1
+    assert changed > 50
+
+
+def test_a_fit_whose_loss_did_not_fall_refreshes_nothing(whole: Path) -> None:
+    before, _, _, network, _ = refreshed(whole, "none", {})
+    newest = network.version
+    for losses, same in (
+        ({newest - 1: 0.1, newest: 0.2}, True),
+        ({newest - 1: 0.2, newest: 0.1}, False),
+        ({newest: 0.1}, True),
+        ({}, True),
+    ):
+        _, after, *_ = refreshed(whole, "better-fits", losses)
+        assert (after["reward"].tobytes() == before["reward"].tobytes()) is same
