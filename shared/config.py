@@ -320,6 +320,9 @@ class LearningConfig(Section):
     """Episodes between fitting phases; 0: never."""
     fit_every_actions: int = Field(default=0, ge=0)
     """Actions between them, in place of `fit_every`; 0: episodes are counted (E39)."""
+    fit_after_fill: bool = False
+    """A fitting phase at the first episode, too: the robot learns from the samples that filled the
+    memory before it drives much with an untrained network."""
     fit_epochs: int = Field(default=3, ge=1, le=1000)
     augmentation: Literal["none", "mirror"] = "none"
     """mirror: half of all samples, by chance, are mirrored for training, left and right

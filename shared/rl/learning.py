@@ -78,7 +78,9 @@ class Trainer:
         self._mean.restart()
         if not len(samples):
             return
-        if due(now, self._learning.fit_every, self._learning.fit_every_actions):
+        learning = self._learning
+        first = learning.fit_after_fill and now.episode == 1
+        if first or due(now, learning.fit_every, learning.fit_every_actions):
             yield from self._fit(samples, now.episode)
         else:
             yield from self._mini_batches(samples, now.episode)

@@ -223,6 +223,18 @@ def test_fitting_visits_each_sample_once_per_epoch(n: int, size: int, epochs: in
     assert recorder.fits == 1
 
 
+@pytest.mark.parametrize(("after_fill", "fits"), [(True, [1, 4, 8]), (False, [4, 8])])
+def test_a_fit_comes_right_after_the_fill_where_it_is_asked_for(
+    after_fill: bool, fits: list[int]
+) -> None:
+    recorder = Recorder(
+        batch_size=4, fit_every=4, fit_epochs=1, mini_batches_per_episode=0,
+        fit_after_fill=after_fill,
+    )  # fmt: skip
+    found = [e for e in range(10) if list(recorder.learn(make_store(8), Moment(e)))]
+    assert found == fits
+
+
 def test_epochs_are_shuffled_differently_and_the_same_in_a_second_run() -> None:
     first = Recorder(batch_size=50, fit_every=10)
     second = Recorder(batch_size=50, fit_every=10)
