@@ -21,6 +21,7 @@ from shared.numerics import choose
 from shared.rl.memory import SAMPLE, ReplayMemory
 from shared.rl.predictor import Predictor
 from shared.rl.retention.rmm import recompute_marks
+from shared.rl.retention.strategy import Situation
 
 REQUIRED, AIM = 4.0, 7.0
 PARTS = 5
@@ -154,7 +155,7 @@ def second_pass(mode: Mode, ours: Predictor) -> tuple[Bar, str]:
 
         start_s = time.perf_counter()
         network = SimpleNamespace(version=ours.version, descriptors=describe)
-        recompute_marks(memory, MemoryConfig(), 1, network)
+        recompute_marks(Situation(memory, 0, MemoryConfig(), network, seed=1), 1)
         spent[turn] = time.perf_counter() - start_s
     rows = [
         [name, len(images) - added * (1 - turn), described[turn], spent[turn]]

@@ -87,7 +87,7 @@ def measure(size: int, rounds: int) -> Times:
 
     network = SimpleNamespace(version=1, descriptors=describe)
     passes = [
-        seconds(lambda: recompute_marks(memory, config, BITS, network))
+        seconds(lambda: recompute_marks(Situation(memory, 0, config, network, seed=1), BITS))
         for _ in range(3 if size < 100_000 else 1)
     ]
     memory.rows["candidate"], memory.rows["marked_by"] = True, 1

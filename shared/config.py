@@ -268,6 +268,12 @@ class MemoryConfig(Section):
     """Which samples are discarded when the memory is full (A28-A34)."""
     rule: Literal["paper", "cover"] = "paper"
     """Whether a sample is compared with all newer ones or only with kept ones (E23)."""
+    descriptor: Literal["maps", "first-maps", "fconn1", "thumbnail", "simhash"] = "maps"
+    """What images are compared by: maps or FConn1 of the network in force, maps of the first
+    network, brightness of neighbours in a thumbnail, or random projections (A29)."""
+    mark_share: Probability = 0.0
+    """If above 0, a search takes, in place of the threshold, the fewest bits at which this share of
+    the samples of actions above their share are candidates."""
     threshold_percent: int = Field(default=1, ge=1, le=100)
     """Similarity threshold at the start, in % of 120 bits (A32, E18). 100: all are similar."""
     threshold_max_percent: int = Field(default=7, ge=1, le=100)
@@ -420,10 +426,11 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        filters = self.network.filters
-        if self.memory.strategy == "rmm" and filters % 16 and 16 % filters:
+        filters, name = self.network.filters, self.memory.strategy
+        of_maps = STRATEGIES[name].describes and self.memory.descriptor in ("maps", "first-maps")
+        if of_maps and filters % 16 and 16 % filters:
             raise ValueError(
-                f"memory.strategy 'rmm' needs network.filters to divide 16 or to be a multiple "
+                f"memory.strategy '{name}' needs network.filters to divide 16 or to be a multiple "
                 f"of 16, got {filters}"
             )
         return self

@@ -34,6 +34,12 @@ def image_with(front: bytes) -> bytes:
     return front + bytes(IMAGE_BYTES - len(front))
 
 
+def images_with(fronts: Sequence[bytes]) -> Images:
+    """Images that begin with these bytes and are black elsewhere: uint8 [n, 50, 75]."""
+    together = b"".join(image_with(front) for front in fronts)
+    return np.frombuffer(together, np.uint8).reshape(len(fronts), *IMAGE_SHAPE)
+
+
 def fill_store(
     store: SampleStore,
     ids: Sequence[int],
@@ -111,11 +117,13 @@ def make_episode(n: int, *, seed: int = 0, images: Images | None = None, **given
 class FakePredictor:
     """Predictions and descriptors that are simple functions of image and version.
 
-    Q values come from the first four bytes of the image, the descriptor is the first 15 bytes.
+    Q values come from the first four bytes of the image, the descriptor is the first 15 bytes,
+    that of units the next 15.
     """
 
     def __init__(self, version: int = 1) -> None:
         self.version = version
+        self._first: FakePredictor | None = None
         self.described: list[int] = []
         """Number of images of each call of `descriptors`."""
 
@@ -131,6 +139,23 @@ class FakePredictor:
         """uint8 [n, 15]."""
         self.described.append(len(images))
         return images.reshape(len(images), -1)[:, :15].copy()
+
+    def unit_descriptors(self, images: Images, progress: Any = None) -> Any:
+        """uint8 [n, 15]."""
+        self.described.append(len(images))
+        return images.reshape(len(images), -1)[:, 15:30].copy()
+
+    def hidden(self, images: Images, actions: Any, progress: Any = None) -> Any:
+        """float32 [n, 128] and [n]."""
+        numbers = np.array([int.from_bytes(i.tobytes()[:4], "little") + 1 for i in images])
+        angles = numbers.reshape(-1, 1) * np.arange(1, 129) + self.version
+        return np.abs(np.sin(angles)).astype(np.float32), self.values(images, actions)
+
+    def first(self, seed: int) -> FakePredictor:
+        """Version 1."""
+        if self._first is None:
+            self._first = FakePredictor(1)
+        return self._first
 
 
 def fake_values(image: bytes, version: int) -> list[float]:

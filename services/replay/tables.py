@@ -35,7 +35,7 @@ from shared.facts import IMAGE_SHAPE
 from shared.rl.memory import SAMPLE
 from shared.rl.retention.strategy import columns
 
-SCHEMA = 4
+SCHEMA = 5
 MAP_BYTES = 1 << 38
 """Largest size of the file; only what is used exists."""
 REWARDS = np.dtype([("id", "<u8"), ("reward", "<f4")])

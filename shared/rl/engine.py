@@ -13,17 +13,23 @@ import torch
 from torch import Tensor
 
 from shared.facts import ACTION_COUNT, IMAGE_SHAPE
-from shared.rl.descriptor import BLOCKS, block_sums
-from shared.rl.network import QNetwork, channels_last
+from shared.rl.descriptor import BLOCKS, block_sums, unit_sums
+from shared.rl.network import HIDDEN, QNetwork, channels_last
 
 if TYPE_CHECKING:
     from shared.config import Numerics
 
 Images = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float32]
-Head = Literal["values", "sums"]
-"""Clipped Q(s, a) of all actions [n, 3], or the sums descriptors are made of [n, 16]."""
-WIDTHS: dict[Head, int] = {"values": ACTION_COUNT, "sums": BLOCKS}
+Head = Literal["values", "sums", "units", "hidden"]
+"""Clipped Q(s, a) of all actions [n, 3]; the sums descriptors are made of, of maps or of units of
+FConn1 [n, 16]; or FConn3 and the unclipped Q of all actions, one action after the other."""
+WIDTHS: dict[Head, int] = {
+    "values": ACTION_COUNT,
+    "sums": BLOCKS,
+    "units": BLOCKS,
+    "hidden": ACTION_COUNT * (HIDDEN + 1),
+}
 Progress = Callable[[int, int], None]
 """Called with (images done, images in all)."""
 
@@ -129,4 +135,9 @@ def padded(images: Images, size: int) -> Iterator[tuple[Images, int, int]]:
 def _output(network: QNetwork, maps: Tensor, head: Head) -> Tensor:
     if head == "sums":
         return block_sums(maps)
+    if head == "units":
+        return unit_sums(network.state(maps))
+    if head == "hidden":
+        hidden = network.all_hidden(maps)
+        return torch.cat([hidden, network.out(hidden)], dim=1).reshape(len(maps), -1)
     return network.all_values(maps).clamp(-1.0, 1.0)

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 POOLED = {"ccpccp": (False, True, False, True), "cpcccp": (True, False, False, True)}
 """Which of the four convolutions a pool follows, by layout (E16)."""
+HIDDEN = 128
+"""Units of FConn1 and of FConn3."""
 MAX_WEIGHT_BYTES = 64 * 1024 * 1024
 
 
@@ -47,10 +49,10 @@ class QNetwork(nn.Module):
         self.conv2 = nn.Conv2d(filters, filters, 3)
         self.conv3 = nn.Conv2d(filters, filters, 3)
         self.conv4 = nn.Conv2d(filters, filters, 3)
-        self.fconn1 = nn.Linear(filters * MAP_HEIGHT * MAP_WIDTH, 128)
+        self.fconn1 = nn.Linear(filters * MAP_HEIGHT * MAP_WIDTH, HIDDEN)
         self.fconn2 = nn.Linear(ACTION_BITS, 32)
-        self.fconn3 = nn.Linear(128 + 32, 128)
-        self.out = nn.Linear(128, 1)
+        self.fconn3 = nn.Linear(HIDDEN + 32, HIDDEN)
+        self.out = nn.Linear(HIDDEN, 1)
         self.register_buffer(
             "action_vectors", torch.tensor([action.vector for action in ACTIONS]), persistent=False
         )
@@ -73,23 +75,26 @@ class QNetwork(nn.Module):
             x = F.relu(x)
         return x
 
+    def state(self, maps: Tensor) -> Tensor:
+        """Outputs of FConn1 [n, 128] from maps [n, filters, 9, 15]."""
+        return F.relu(self.fconn1(maps.flatten(1)))
+
     def values(self, maps: Tensor, actions: Tensor) -> Tensor:
         """Unclipped Q(s, a) [n] from maps [n, filters, 9, 15] and action numbers [n]."""
-        state = F.relu(self.fconn1(maps.flatten(1)))
         action = F.relu(self.fconn2(self.action_vectors[actions]))
-        return self._out(state, action)
+        hidden = F.relu(self.fconn3(torch.cat([self.state(maps), action], dim=1)))
+        return torch.as_tensor(self.out(hidden)).squeeze(1)
 
     def all_values(self, maps: Tensor) -> Tensor:
         """Unclipped Q(s, a) [n, actions] of all actions: one trunk, three heads."""
-        state = F.relu(self.fconn1(maps.flatten(1)))
-        encoded = F.relu(self.fconn2(self.action_vectors))
+        return torch.as_tensor(self.out(self.all_hidden(maps))).view(len(maps), -1)
+
+    def all_hidden(self, maps: Tensor) -> Tensor:
+        """Outputs of FConn3 for all actions of the first image, then the next: [n actions, 128]."""
+        state, encoded = self.state(maps), F.relu(self.fconn2(self.action_vectors))
         n, actions = len(state), len(encoded)
         states = state.unsqueeze(1).expand(n, actions, -1).reshape(n * actions, -1)
-        return self._out(states, encoded.repeat(n, 1)).view(n, actions)
-
-    def _out(self, state: Tensor, action: Tensor) -> Tensor:
-        hidden = F.relu(self.fconn3(torch.cat([state, action], dim=1)))
-        return torch.as_tensor(self.out(hidden)).squeeze(1)
+        return F.relu(self.fconn3(torch.cat([states, encoded.repeat(n, 1)], dim=1)))
 
 
 def initialised(config: NetworkConfig, seed: int) -> QNetwork:

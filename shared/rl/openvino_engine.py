@@ -5,6 +5,7 @@ The only file that imports openvino, and imported only where a configuration ask
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,10 +24,13 @@ MOST = 32
 """Images of one pass."""
 HINTS = {"float32": "f32", "bfloat16": "bf16"}
 Parameters = dict[str, Floats]
+USUAL: tuple[Head, ...] = ("values", "sums")
+"""Heads of the model that every weights version gets. Each other one has a model of its own: an
+output more costs time in each pass."""
 
 
 class OpenVinoEngine:
-    """One compiled model with both heads; compiling takes some hundredths of a second.
+    """One compiled model with the usual heads; compiling takes some hundredths of a second.
 
     Its bits do not depend on the number of images in a pass: passes are as large as they come, up
     to `MOST`, and `numerics.batch` plays no part.
@@ -41,34 +45,38 @@ class OpenVinoEngine:
             # Several services share the cores: none may tie itself to one.
             "ENABLE_CPU_PINNING": False,
         }
-        self._request: ov.InferRequest | None = None
-        self._heads: tuple[Head, ...] = ()
+        self._network: tuple[Parameters, tuple[bool, ...], Floats] | None = None
+        self._has_sums = False
+        self._requests: dict[tuple[Head, ...], ov.InferRequest] = {}
 
     def load(self, network: QNetwork) -> None:
         """Compile the network with its present parameters."""
-        parameters = {name: t.detach().cpu().numpy() for name, t in network.state_dict().items()}
-        maps, images = _maps(parameters, network.pooled)
-        filters = len(parameters["conv4.bias"])
-        outputs: dict[Head, ov.Output] = {
-            "values": _values(maps, parameters, network.action_vectors.cpu().numpy())
-        }
-        if filters % BLOCKS == 0 or BLOCKS % filters == 0:
-            outputs["sums"] = _sums(maps, filters)
-        model = ov.Model(list(outputs.values()), [images], "q")
-        compiled = self._core.compile_model(model, "CPU", self._options)
-        self._request, self._heads = compiled.create_infer_request(), tuple(outputs)
+        own = {name: t.detach().cpu().numpy().copy() for name, t in network.state_dict().items()}
+        self._network = own, network.pooled, network.action_vectors.cpu().numpy().copy()
+        self._has_sums, self._requests = _has_sums(own), {}
+        self._request(USUAL)
+
+    def _request(self, heads: tuple[Head, ...]) -> ov.InferRequest:
+        """What runs these heads. A model for rare ones is compiled when one is first asked for."""
+        assert self._network is not None, "no weights are loaded"
+        if heads not in self._requests:
+            model = _model(heads, *self._network)
+            compiled = self._core.compile_model(model, "CPU", self._options)
+            self._requests[heads] = compiled.create_infer_request()
+        return self._requests[heads]
 
     def run(self, images: Images, head: Head, progress: Progress | None = None) -> Floats:
         """See `Engine.run`."""
-        assert self._request is not None, "no weights are loaded"
-        if head not in self._heads:
+        heads = USUAL if head in USUAL else (head,)
+        request = self._request(heads)
+        if head == "sums" and not self._has_sums:
             raise ValueError(f"filters must divide {BLOCKS} or be a multiple of it")
         outputs = np.empty((len(images), WIDTHS[head]), np.float32)
-        place = self._heads.index(head)
+        place = heads.index(head)
         for start in range(0, len(images), MOST):
             part = images[start : start + MOST]
-            self._request.infer([np.ascontiguousarray(part)], share_inputs=True)
-            outputs[start : start + MOST] = self._request.get_output_tensor(place).data
+            request.infer([np.ascontiguousarray(part)], share_inputs=True)
+            outputs[start : start + MOST] = request.get_output_tensor(place).data
             if progress is not None:
                 progress(start + len(part), len(images))
         return outputs
@@ -90,22 +98,69 @@ def _maps(p: Parameters, pooled: tuple[bool, ...]) -> tuple[ov.Output, ov.Node]:
     return x.output(0), images
 
 
-def _values(maps: ov.Output, p: Parameters, actions: Floats) -> ov.Output:
-    """Clipped values of all actions [n, 3].
+def _model(
+    heads: tuple[Head, ...], p: Parameters, pooled: tuple[bool, ...], actions: Floats
+) -> ov.Model:
+    """A model with these heads, without sums where the network has none."""
+    maps, images = _maps(p, pooled)
+    make: dict[Head, Callable[[], ov.Output]] = {
+        "values": lambda: _values(maps, p, actions),
+        "sums": lambda: _sums(maps, len(p["conv4.bias"])),
+        "units": lambda: _unit_sums(maps, p),
+        "hidden": lambda: _hidden(maps, p, actions),
+    }
+    outputs = [make[head]() for head in heads if head != "sums" or _has_sums(p)]
+    return ov.Model(outputs, [images], "q")
 
-    FConn3 multiplies state and action side by side: the action's part is the same for all images
+
+def _has_sums(p: Parameters) -> bool:
+    filters = len(p["conv4.bias"])
+    return filters % BLOCKS == 0 or BLOCKS % filters == 0
+
+
+def _state(maps: ov.Output, p: Parameters) -> ov.Node:
+    """FConn1 [n, 128]."""
+    flat = ops.reshape(maps, np.array([0, -1]), special_zero=True)
+    return ops.relu(ops.add(_product(flat, p["fconn1.weight"]), p["fconn1.bias"]))
+
+
+def _all_hidden(maps: ov.Output, p: Parameters, actions: Floats) -> ov.Node:
+    """FConn3 for all actions [n, 3, 128].
+
+    It multiplies state and action side by side: the action's part is the same for all images
     and computed here, once.
     """
-    flat = ops.reshape(maps, np.array([0, -1]), special_zero=True)
-    state = ops.relu(ops.add(_product(flat, p["fconn1.weight"]), p["fconn1.bias"]))
+    state = _state(maps, p)
     size = len(p["fconn1.bias"])
     coded = np.maximum(actions @ p["fconn2.weight"].T + p["fconn2.bias"], 0.0)
     of_action = coded @ p["fconn3.weight"][:, size:].T + p["fconn3.bias"]
     of_state = ops.unsqueeze(_product(state, p["fconn3.weight"][:, :size]), _int(1))
-    hidden = ops.relu(ops.add(of_state, of_action[None].astype(np.float32)))
-    out = ops.add(_product(hidden, p["out.weight"]), p["out.bias"])
+    return ops.relu(ops.add(of_state, of_action[None].astype(np.float32)))
+
+
+def _values(maps: ov.Output, p: Parameters, actions: Floats) -> ov.Output:
+    """Clipped values of all actions [n, 3]."""
+    out = _out(_all_hidden(maps, p, actions), p)
     flat_out = ops.reshape(out, np.array([-1, ACTION_COUNT]), special_zero=False)
     return ops.clamp(flat_out, -1.0, 1.0).output(0)
+
+
+def _hidden(maps: ov.Output, p: Parameters, actions: Floats) -> ov.Output:
+    """FConn3 and unclipped value of one action after the other [n, 3 * 129]."""
+    hidden = _all_hidden(maps, p, actions)
+    both = ops.concat([hidden, _out(hidden, p)], 2)
+    return ops.reshape(both, np.array([0, -1]), special_zero=True).output(0)
+
+
+def _out(hidden: ov.Node, p: Parameters) -> ov.Node:
+    """Unclipped values [n, 3, 1]."""
+    return ops.add(_product(hidden, p["out.weight"]), p["out.bias"])
+
+
+def _unit_sums(maps: ov.Output, p: Parameters) -> ov.Output:
+    """Sums of 16 blocks of FConn1 [n, 16]."""
+    blocks = ops.reshape(_state(maps, p), np.array([0, BLOCKS, -1]), special_zero=True)
+    return ops.reduce_sum(blocks, _int(2), keep_dims=False).output(0)
 
 
 def _sums(maps: ov.Output, filters: int) -> ov.Output:

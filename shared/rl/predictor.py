@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from shared.facts import ACTION_COUNT
 from shared.rl.descriptor import describe
 from shared.rl.engine import Engine, Progress, TorchEngine
-from shared.rl.network import QNetwork, load_bytes
+from shared.rl.network import HIDDEN, QNetwork, initialised, load_bytes, to_bytes
 
 if TYPE_CHECKING:
     from shared.config import NetworkConfig, Numerics
@@ -29,9 +30,10 @@ class Predictor:
     def __init__(self, network: NetworkConfig, numerics: Numerics) -> None:
         """Raises ValueError for unsettled numerics, ImportError for an engine not installed."""
         self.version = 0
-        self._numerics = numerics
+        self._config, self._numerics = network, numerics
         self._network = QNetwork(network)
         self._engine = engine(numerics)
+        self._firsts: dict[int, Predictor] = {}
 
     def load(self, version: int, data: bytes) -> None:
         """Become `version`, given as safetensors bytes. Raises ValueError if they do not fit."""
@@ -64,6 +66,32 @@ class Predictor:
     ) -> npt.NDArray[np.uint8]:
         """Packed 120-bit descriptors uint8 [n, 15] (A29)."""
         return describe(self._engine.run(images, "sums", progress))
+
+    def unit_descriptors(
+        self, images: Images, progress: Progress | None = None
+    ) -> npt.NDArray[np.uint8]:
+        """Such descriptors made of the 128 units of FConn1, 8 a block: uint8 [n, 15]."""
+        return describe(self._engine.run(images, "units", progress))
+
+    def hidden(
+        self, images: Images, actions: npt.NDArray[np.uint8], progress: Progress | None = None
+    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+        """FConn3 for the action of each image, float32 [n, 128], and the unclipped Q, float32 [n].
+
+        Q is the last layer's weights times FConn3, plus its bias.
+        """
+        every = self._engine.run(images, "hidden", progress)
+        of_actions = every.reshape(len(images), ACTION_COUNT, HIDDEN + 1)
+        own = of_actions[np.arange(len(images)), actions]
+        return own[:, :-1], own[:, -1]
+
+    def first(self, seed: int) -> Predictor:
+        """The predictor of version 1, as a run with this seed begins. It is made once."""
+        if seed not in self._firsts:
+            first = Predictor(self._config, self._numerics)
+            first.load(1, to_bytes(initialised(self._config, seed)))
+            self._firsts[seed] = first
+        return self._firsts[seed]
 
 
 def engine(numerics: Numerics) -> Engine:

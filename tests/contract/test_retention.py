@@ -147,7 +147,15 @@ def shares_after_minus(name: str, seed: int) -> float:
 
 @pytest.mark.parametrize(
     ("name", "expected"),
-    [("normm", 0.0), ("quotas", 0.0), ("reservoir", 29 / 36), ("quotas-reservoir", 29 / 36)],
+    [
+        ("normm", 0.0),
+        ("quotas", 0.0),
+        ("reservoir", PLUS / (PLUS + MINUS)),
+        ("quotas-reservoir", PLUS / (PLUS + MINUS)),
+        ("random", np.exp(-MINUS)),
+        ("half", 0.5 * PLUS / (PLUS + MINUS)),
+        ("worlds", 0.5),
+    ],
 )
 def test_so_much_of_plus_is_left_after_minus(name: str, expected: float) -> None:
     """Of nothing like another, chance and age alone decide."""

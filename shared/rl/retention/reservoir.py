@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from shared.rl.retention.amounts import surplus
-from shared.rl.retention.strategy import Discard, Situation, Strategy, chances, lowest
+from shared.rl.retention.least_worth import LeastWorth
+from shared.rl.retention.strategy import Floats, Situation, chances
 
 
-class Reservoir(Strategy):
+class Reservoir(LeastWorth):
     """The samples stay whose chances are highest, until floor(0.99 N) remain.
 
     A sample draws its chance once, from its insertion number. So what stays is a fair draw from all
     samples so far, however often the memory was reduced (Vitter, algorithm R, with a fixed key).
     """
 
-    def choose(self, there: Situation) -> Discard:
-        """Choose the samples with the lowest chances."""
-        memory = there.memory
-        gone = lowest(chances(there.seed, memory.ids), surplus(memory))
-        return Discard(memory.capacity, memory.ids[gone])
+    def worth(self, there: Situation) -> Floats:
+        """Return the chances of all samples: float64 [n]."""
+        return chances(there.seed, there.memory.ids)
 
 
 STRATEGY = Reservoir()

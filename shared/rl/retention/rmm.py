@@ -5,24 +5,36 @@ A29-A34 and A44, in the reading of E17b, E19-E23, E32 and E46.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
 from shared.facts import ACTION_COUNT, SHORT_NAMES
-from shared.rl.descriptor import BYTES, threshold_bits
+from shared.rl.descriptor import BITS, threshold_bits
 from shared.rl.retention.amounts import surplus_by_action
-from shared.rl.retention.strategy import Discard, Network, Rows, Situation, Strategy, beyond
-from shared.rl.similarity import similar_to_newer
+from shared.rl.retention.columns import DESCRIBED, renew_descriptors
+from shared.rl.retention.strategy import Discard, Rows, Situation, Strategy
+from shared.rl.similarity import Descriptors, Mask, similar_to_newer
 
 if TYPE_CHECKING:
     from shared.config import MemoryConfig
-    from shared.rl.engine import Progress
     from shared.rl.memory import Ids, ReplayMemory
 
 THESIS_CAPACITY = 45_000
 RECOMPUTE_BELOW, RAISE_AT_MOST, CAPACITY_STEP = 1000, 2000, 5000
+Rule = Literal["paper", "cover"]
+Search = Callable[[Descriptors, int, Rule], Mask]
+"""(descriptors of one action, bits, rule) -> which of them are candidates."""
+
+
+class Part(NamedTuple):
+    """Samples of which some must go."""
+
+    own: Mask
+    """Which samples of the memory these are: bool [n]."""
+    surplus: int
+    """How many of them must go."""
 
 
 class RMM(Strategy):
@@ -36,8 +48,7 @@ class RMM(Strategy):
     """
 
     columns = (
-        ("descriptor", "u1", (BYTES,)),
-        ("described_by", "<u4"),  # weights version of the descriptor; 0: none yet
+        *DESCRIBED,
         ("candidate", "?"),
         ("forced", "?"),  # marked by decree (A44): a recomputation does not wipe it
         ("marked_by", "<u4"),
@@ -59,14 +70,14 @@ class RMM(Strategy):
         """Choose the oldest candidates, after a search where there are too few of them."""
         memory, config = there.memory, there.config
         capacity, percent = memory.capacity, memory.kept["threshold_percent"]
-        recomputed = _too_few_candidates(memory, config)
+        recomputed = self._too_few_candidates(memory, config)
         if recomputed:
-            recompute_marks(memory, config, threshold_bits(percent), there.network, there.progress)
-            failed = _search_failed(memory, config)
-            capacity = _grown_capacity(memory, config, failed)
+            recompute_marks(there, self._bits(there, percent), self.similar)
+            failed = self._search_failed(memory, config)
+            capacity = self._grown_capacity(memory, config, failed)
             if failed and capacity == memory.capacity:
                 percent = min(percent + 1, config.threshold_max_percent)
-        ids, last_resort = _oldest_candidates(memory, surplus_by_action(memory, capacity))
+        ids, last_resort = _oldest_candidates(memory, self.losing(memory, capacity))
         return Discard(
             capacity,
             ids,
@@ -81,6 +92,18 @@ class RMM(Strategy):
             if last_resort
             else "",
         )
+
+    def losing(self, memory: ReplayMemory, capacity: int) -> list[Part]:
+        """Return the samples that must become fewer under this capacity, in parts that each must.
+
+        They are those of each action above its share.
+        """
+        actions, surplus = memory.rows["action"].copy(), surplus_by_action(memory, capacity)
+        return [Part(actions == action, count) for action, count in surplus.items()]
+
+    def similar(self, descriptors: Descriptors, bits: int, rule: Rule) -> Mask:
+        """Mark samples of one action, oldest first, that look like a newer one: bool [n]."""
+        return similar_to_newer(descriptors, bits, rule)
 
     def state(self, memory: ReplayMemory) -> dict[str, int]:
         """Return the threshold of the next search and the candidates of each action."""
@@ -98,6 +121,45 @@ class RMM(Strategy):
         yield bool(np.all(known)), "candidates know the version that marked them"
         described = (rows["marked_by"] == 0) | (rows["described_by"] > 0)
         yield bool(np.all(described)), "marked samples have a descriptor"
+
+    def _bits(self, there: Situation, percent: int) -> int:
+        """In how many bits two similar samples may differ: by the threshold, or `mark_share`."""
+        memory, config, bits = there.memory, there.config, threshold_bits(percent)
+        if config.mark_share > 0.0:
+            renew_descriptors(there)
+            own = np.any([part.own for part in self.losing(memory, memory.capacity)], axis=0)
+            bits = least_bits(memory, own, config, self.similar)
+        return bits
+
+    def _too_few_candidates(self, memory: ReplayMemory, config: MemoryConfig) -> bool:
+        """Return whether marks must be computed anew (A31, E20)."""
+        least = config.recompute_below or scaled_count(RECOMPUTE_BELOW, memory.capacity)
+        return self._fewer(memory, memory.capacity, least)
+
+    def _search_failed(self, memory: ReplayMemory, config: MemoryConfig) -> bool:
+        """Return whether a part that must lose samples has too few candidates (A32, E19)."""
+        most = config.raise_at_most or scaled_count(RAISE_AT_MOST, memory.capacity)
+        marked = memory.rows["candidate"]
+        losing = self.losing(memory, memory.capacity)
+        return any(np.count_nonzero(marked[own]) <= most for own, _ in losing)
+
+    def _grown_capacity(self, memory: ReplayMemory, config: MemoryConfig, failed: bool) -> int:
+        """Return N after a search: one step more if it failed, up to `capacity_max` (A44, E32).
+
+        Further steps follow while candidates could not cover what must go: nothing goes by age from
+        a memory that may still grow. In memories of the thesis's size one step always suffices.
+        """
+        step = config.capacity_step or scaled_count(CAPACITY_STEP, config.capacity)
+        capacity = memory.capacity
+        while capacity < config.capacity_max and (failed or self._fewer(memory, capacity)):
+            capacity, failed = min(capacity + step, config.capacity_max), False
+        return capacity
+
+    def _fewer(self, memory: ReplayMemory, capacity: int, least: int = 0) -> bool:
+        """Return whether a part has fewer candidates than `least` or than must go."""
+        marked = memory.rows["candidate"]
+        losing = self.losing(memory, capacity)
+        return any(np.count_nonzero(marked[own]) < max(least, surplus) for own, surplus in losing)
 
 
 STRATEGY = RMM()
@@ -126,74 +188,56 @@ def force_candidates(memory: ReplayMemory, ids: Ids) -> None:
     memory.rows["candidate"][ranks] = True
 
 
-def recompute_marks(
-    memory: ReplayMemory,
-    config: MemoryConfig,
-    bits: int,
-    network: Network,
-    progress: Progress | None = None,
-) -> None:
+def recompute_marks(there: Situation, bits: int, search: Search = similar_to_newer) -> None:
     """Mark anew, for every action, what looks like a newer sample (A30, E20).
 
-    Descriptors already made by this weights version are used again; forced marks stay (A44).
+    Descriptors that are up to date are used again; forced marks stay (A44).
     """
-    outdated = np.flatnonzero(memory.rows["described_by"] != network.version)
-    total, done = len(memory), len(memory) - len(outdated)
-    for some, images in memory.parts(outdated):
-        report = beyond(done, total, progress)
-        memory.rows["descriptor"][some] = network.descriptors(images, report)
-        memory.rows["described_by"][some] = network.version
-        done += len(some)
+    renew_descriptors(there)
+    memory = there.memory
+    similar = _similar(memory, bits, there.config.rule, search)
+    memory.rows["candidate"] = similar | memory.rows["forced"]
+    memory.rows["marked_by"] = there.network.version
+
+
+def least_bits(memory: ReplayMemory, own: Mask, config: MemoryConfig, search: Search) -> int:
+    """Return the least number of bits at which `mark_share` of some samples are candidates.
+
+    own: which samples these are, bool [n]. All 120 bits if no number suffices.
+    """
+
+    def enough(bits: int, rule: Rule) -> bool:
+        marked = _similar(memory, bits, rule, search) | memory.rows["forced"]
+        return bool(np.mean(marked[own]) >= config.mark_share)
+
+    low, high = 0, BITS
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (low, middle) if enough(middle, "paper") else (middle + 1, high)
+    # The rule "cover" marks some of what "paper" marks, and not always more at more bits.
+    while config.rule == "cover" and low < BITS and not enough(low, "cover"):
+        low += 1
+    return low
+
+
+def _similar(memory: ReplayMemory, bits: int, rule: Rule, search: Search) -> Mask:
+    """What the search finds among the samples of each action: bool [n]."""
+    similar = np.zeros(len(memory), np.bool_)
     for action in range(ACTION_COUNT):
         own = np.flatnonzero(memory.rows["action"] == action)
-        similar = similar_to_newer(memory.rows["descriptor"][own], bits, config.rule)
-        memory.rows["candidate"][own] = similar | memory.rows["forced"][own]
-    memory.rows["marked_by"] = network.version
+        similar[own] = search(memory.rows["descriptor"][own], bits, rule)
+    return similar
 
 
-def _too_few_candidates(memory: ReplayMemory, config: MemoryConfig) -> bool:
-    """Return whether marks must be computed anew (A31, E20)."""
-    least = config.recompute_below or scaled_count(RECOMPUTE_BELOW, memory.capacity)
-    return _fewer(memory, memory.capacity, least)
-
-
-def _search_failed(memory: ReplayMemory, config: MemoryConfig) -> bool:
-    """Return whether some action that must discard still has too few candidates (A32, E19)."""
-    most = config.raise_at_most or scaled_count(RAISE_AT_MOST, memory.capacity)
-    candidates = candidates_by_action(memory)
-    return any(candidates[action] <= most for action in surplus_by_action(memory, memory.capacity))
-
-
-def _grown_capacity(memory: ReplayMemory, config: MemoryConfig, failed: bool) -> int:
-    """Return N after a search: one step more if it failed, up to `capacity_max` (A44, E32).
-
-    Further steps follow while candidates could not cover what must go: nothing goes by age from a
-    memory that may still grow. In memories of the thesis's size one step always suffices.
-    """
-    step = config.capacity_step or scaled_count(CAPACITY_STEP, config.capacity)
-    capacity = memory.capacity
-    while capacity < config.capacity_max and (failed or _fewer(memory, capacity)):
-        capacity, failed = min(capacity + step, config.capacity_max), False
-    return capacity
-
-
-def _fewer(memory: ReplayMemory, capacity: int, least: int = 0) -> bool:
-    """Return whether an action has fewer candidates than `least` or than must go."""
-    candidates = candidates_by_action(memory)
-    surplus = surplus_by_action(memory, capacity)
-    return any(candidates[action] < max(least, count) for action, count in surplus.items())
-
-
-def _oldest_candidates(memory: ReplayMemory, surplus: dict[int, int]) -> tuple[Ids, int]:
+def _oldest_candidates(memory: ReplayMemory, losing: list[Part]) -> tuple[Ids, int]:
     """Return the ids to remove, ascending, and how many of them are no candidates.
 
-    surplus: how many of each action must go. Candidates go first, each kind oldest first.
+    Of each part candidates go first, each kind oldest first.
     """
     # Reading one field of the rows runs through the bytes of all fields, so each is read once.
-    ids, actions, marked = (memory.rows[name].copy() for name in ("id", "action", "candidate"))
+    ids, marked = (memory.rows[name].copy() for name in ("id", "candidate"))
     chosen, last_resort = [ids[:0]], 0
-    for action, count in surplus.items():
-        own = actions == action
+    for own, count in losing:
         candidates = ids[own & marked][:count]
         others = ids[own & ~marked][: count - len(candidates)]
         chosen += [candidates, others]

@@ -35,6 +35,24 @@ class Network(Protocol):
     ) -> npt.NDArray[np.uint8]:
         """Return the packed 120-bit descriptors of images: uint8 [n, 15]."""
 
+    def unit_descriptors(
+        self, images: Images, progress: Progress | None = None
+    ) -> npt.NDArray[np.uint8]:
+        """Return such descriptors made of the units of FConn1: uint8 [n, 15]."""
+
+    def values(
+        self, images: Images, actions: npt.NDArray[np.uint8], progress: Progress | None = None
+    ) -> npt.NDArray[np.float32]:
+        """Return Q(s, a) of the action of each image, clipped: float32 [n]."""
+
+    def hidden(
+        self, images: Images, actions: npt.NDArray[np.uint8], progress: Progress | None = None
+    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+        """Return what FConn3 says, float32 [n, 128], and the unclipped Q(s, a), float32 [n]."""
+
+    def first(self, seed: int) -> Network:
+        """Return the network of version 1, as a run with this seed begins."""
+
 
 @dataclass(frozen=True)
 class Situation:
@@ -123,8 +141,8 @@ def strategy(name: str) -> Strategy:
 
 
 def columns() -> list[tuple[Any, ...]]:
-    """Return the columns of all strategies, in the order of the table."""
-    return [column for name in STRATEGIES for column in strategy(name).columns]
+    """Return the columns of all strategies, in the order of the table; shared ones once."""
+    return list(dict.fromkeys(c for name in STRATEGIES for c in strategy(name).columns))
 
 
 def begin(config: MemoryConfig) -> dict[str, int]:

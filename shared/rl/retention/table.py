@@ -15,14 +15,29 @@ class Row(NamedTuple):
     """File in this folder whose `STRATEGY` it is."""
     tells: tuple[str, ...] = ()
     """Names of the whole numbers that its discards tell, each a column of `episodes.csv`."""
+    describes: bool = False
+    """Whether it compares descriptors, of which `memory.descriptor` chooses the kind."""
+
+
+SEARCH = ("last_resort", "recomputed", "threshold_percent")
 
 
 STRATEGIES = {
-    "rmm": Row("rmm", tells=("last_resort", "recomputed", "threshold_percent")),
+    "rmm": Row("rmm", tells=SEARCH, describes=True),
     "normm": Row("normm"),
     "reservoir": Row("reservoir"),
     "quotas": Row("quotas"),
     "quotas-reservoir": Row("quotas_reservoir"),
+    "random": Row("chance"),
+    "half": Row("half"),
+    "worlds": Row("worlds"),
+    "coverage": Row("coverage", describes=True),
+    "coverage-pose": Row("coverage_pose"),
+    "surprise": Row("surprise"),
+    "loss-reservoir": Row("loss_reservoir"),
+    "gradients": Row("gradients"),
+    "novelty": Row("novelty", tells=SEARCH, describes=True),
+    "rmm-total": Row("rmm_total", tells=SEARCH, describes=True),
 }
-TELLS = tuple(name for row in STRATEGIES.values() for name in row.tells)
+TELLS = tuple(dict.fromkeys(name for row in STRATEGIES.values() for name in row.tells))
 """What any strategy tells. It is 0 while a strategy is in force that tells nothing of that name."""

@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 import torch
+from builders import make_images
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shared.rl.descriptor import BITS, BYTES, block_sums, describe, threshold_bits
+from shared.rl.descriptor import (
+    BITS,
+    BYTES,
+    block_sums,
+    describe,
+    random_planes,
+    signs_of,
+    threshold_bits,
+    thumbnail,
+    unit_sums,
+)
 
 FAST = settings(deadline=None, max_examples=80, derandomize=True)
 
@@ -103,3 +116,58 @@ def test_memory_layout_of_the_maps_does_not_matter(channels_last: bool) -> None:
 def test_percent_become_whole_bits_as_the_thesis_counts_them() -> None:
     assert [threshold_bits(p) for p in range(1, 8)] == [1, 2, 3, 4, 6, 7, 8]
     assert threshold_bits(100) == 120
+
+
+def test_a_block_of_units_is_eight_consecutive_ones() -> None:
+    units = torch.arange(2 * 128, dtype=torch.float32).reshape(2, 128)
+    expected = [[sum(range(8 * i, 8 * i + 8)) for i in range(k, k + 16)] for k in (0, 16)]
+    assert unit_sums(units).tolist() == expected
+
+
+def naive_thumbnail(image: np.ndarray) -> list[list[Fraction]]:
+    """Area means 16 wide and 8 high, pixel by pixel, exactly."""
+
+    def overlap(pixel: int, cell: int, size: Fraction) -> Fraction:
+        return max(Fraction(0), min(pixel + 1, (cell + 1) * size) - max(pixel, cell * size))
+
+    height, width = Fraction(50, 8), Fraction(75, 16)
+    return [
+        [
+            sum(
+                int(image[y, x]) * overlap(y, row, height) * overlap(x, column, width)
+                for y in range(int(row * height), min(int((row + 1) * height) + 1, 50))
+                for x in range(int(column * width), min(int((column + 1) * width) + 1, 75))
+            )
+            / (height * width)
+            for column in range(16)
+        ]
+        for row in range(8)
+    ]
+
+
+def test_a_thumbnail_compares_exact_means_with_their_right_neighbours() -> None:
+    images = make_images(3)
+    images[2] = images[2] // 128  # many are close
+    for image, found in zip(images, thumbnail(images), strict=True):
+        means = naive_thumbnail(image)
+        assert bits_of(found) == "".join(
+            "1" if row[i] > row[i + 1] else "0" for row in means for i in range(15)
+        )
+
+
+def test_plain_images_have_no_bits_whatever_their_brightness() -> None:
+    plain = np.repeat(np.array([0, 1, 77, 255], np.uint8), 50 * 75).reshape(4, 50, 75)
+    assert not thumbnail(plain).any()
+    assert not signs_of(plain, random_planes(1)).any()
+    assert thumbnail(plain[:0]).shape == signs_of(plain[:0], random_planes(1)).shape == (0, 15)
+
+
+def test_signs_are_those_of_the_projections_of_the_image_without_its_mean() -> None:
+    images, planes = make_images(6), random_planes(3)
+    assert set(np.unique(planes)) == {-1.0, 1.0}
+    for image, found in zip(images, signs_of(images, planes), strict=True):
+        free = image.reshape(-1) - image.mean()
+        assert bits_of(found) == "".join("1" if free @ plane > 0.0 else "0" for plane in planes.T)
+    darker = images // 2
+    assert np.mean(signs_of(darker, planes) == signs_of(images, planes)) > 0.8
+    assert not np.array_equal(random_planes(4), planes)

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from shared.config import NetworkConfig, Numerics
-from shared.rl.descriptor import block_sums
+from shared.rl.descriptor import block_sums, describe, unit_sums
 from shared.rl.engine import Engine, network_input
-from shared.rl.network import QNetwork, initialised
-from shared.rl.predictor import engine
+from shared.rl.network import QNetwork, initialised, to_bytes
+from shared.rl.predictor import Predictor, engine
 
 torch.set_num_threads(1)
 ENGINES = ["torch", "openvino"]
@@ -48,6 +48,46 @@ def test_outputs_are_those_of_the_network(kind: str, filters: int, layout: str) 
     made = make_engine(kind, network)
     assert made.run(images, "values") == pytest.approx(values.numpy(), abs=1e-5)
     assert made.run(images, "sums") == pytest.approx(sums.numpy(), rel=1e-4, abs=1e-4)
+
+
+@pytest.mark.parametrize("kind", ENGINES)
+def test_units_and_hidden_are_those_of_the_network(kind: Any) -> None:
+    network, images = make_network(16, "ccpccp"), make_images(10)
+    with torch.no_grad():
+        maps = network.maps(network_input(images, "cpu"))
+        units, hidden = unit_sums(network.state(maps)), network.all_hidden(maps)
+        values = network.all_values(maps).numpy()
+    predictor = Predictor(NetworkConfig(filters=16), Numerics(engine=kind, batch=4))
+    predictor.load(3, to_bytes(network))
+    assert make_engine(kind, network).run(images, "units") == pytest.approx(
+        units.numpy(), rel=1e-4, abs=1e-4
+    )
+    assert np.array_equal(
+        predictor.unit_descriptors(images),
+        describe(make_engine(kind, network).run(images, "units")),
+    )
+    actions = np.arange(10, dtype=np.uint8) % 3
+    found, own = predictor.hidden(images, actions)
+    assert found.shape == (10, 128)
+    expected = hidden.reshape(10, 3, 128).numpy()[np.arange(10), actions]
+    assert found == pytest.approx(expected, rel=1e-4, abs=1e-5)
+    assert own == pytest.approx(values[np.arange(10), actions], abs=1e-5)
+    assert predictor.hidden(images[:0], actions[:0])[0].shape == (0, 128)
+
+
+@pytest.mark.parametrize("kind", ENGINES)
+def test_the_first_predictor_is_that_of_a_new_run(kind: Any) -> None:
+    config, numerics = NetworkConfig(filters=16), Numerics(engine=kind, batch=4)
+    predictor, fresh = Predictor(config, numerics), Predictor(config, numerics)
+    predictor.load(3, to_bytes(make_network(16, "ccpccp")))
+    fresh.load(1, to_bytes(initialised(config, 7)))
+    images = make_images(5)
+    first = predictor.first(7)
+    assert first.version == 1
+    assert predictor.successor(4, to_bytes(make_network(16, "ccpccp"))).first(7) is first
+    assert np.array_equal(first.descriptors(images), fresh.descriptors(images))
+    assert not np.array_equal(first.descriptors(images), predictor.first(8).descriptors(images))
+    assert predictor.version == 3
 
 
 def openvino_rounds() -> bool:
