@@ -15,7 +15,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812  (the customary name)
 
-from experiments.drives.choosers import Chooser
+from experiments.drives.choosers import Chooser, each
 from shared.config import Config, NetworkConfig
 from shared.messages import Observation, image_array
 from shared.rl.network import initialised
@@ -65,7 +65,7 @@ def greedy(model: DQN) -> Chooser:
         image = image_array(observation.image)[:, :, np.newaxis].copy()  # PyTorch wants to own it
         return int(model.predict(image, deterministic=True)[0])
 
-    return chosen
+    return each(chosen)
 
 
 def mini_batches(model: DQN) -> int:

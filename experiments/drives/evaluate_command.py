@@ -9,14 +9,14 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.drives import routes
-from experiments.drives.choosers import Chooser, Planned, greedy, uniform
+from experiments.drives.choosers import Chooser, Planned, greedy, side_by_side, uniform
 from experiments.drives.frozen_drives import evaluate
 from experiments.drives.traces import Figures
 from experiments.environment import CorridorEnv
 from experiments.records import EVALUATION_COLUMNS
 from services.commander import frozen
 from services.robot_driver.simulated.world import WorldError
-from shared.config import Config
+from shared.config import ActorNumerics, Config
 from shared.errors import ConfigError
 from shared.run_record import Row, write_csv
 
@@ -51,7 +51,7 @@ def run(path: Path, config: Config, starts: int, actions: int, out: Path) -> Non
         StateError: The network's file is damaged.
     """
     weights = frozen.read(frozen.find(path))
-    network = greedy(weights.predictor(config.network))
+    network = greedy(weights.predictor(config.network, side_by_side(ActorNumerics())))
     try:
         env = CorridorEnv(config=config)
     except WorldError as error:

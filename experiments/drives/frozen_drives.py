@@ -1,13 +1,15 @@
 """Driving without learning: the same starts for whoever drives, what happened, figures of it.
 
-The network is frozen and acts greedily. `planner` and `random` drive through the same code and are
-the ceiling and the floor.
+The robots drive side by side, so that the network predicts for many of them at once. It is frozen
+and acts greedily. `planner` and `random` drive through the same code and are the ceiling and the
+floor.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,7 +40,7 @@ def evaluate(
 ) -> Evaluation:
     """Drive from all starts of the environment's world. The robot stands elsewhere afterwards."""
     poses = start_poses(env.world, env.config.robot.radius_m, starts)
-    traces = [drive(env, choose, n, pose, actions) for n, pose in enumerate(poses)]
+    traces = drive(env, choose, poses, actions)
     return Evaluation(traces, figures_of(env, traces))
 
 
@@ -51,39 +53,78 @@ def figures_of(env: CorridorEnv, traces: Sequence[Trace]) -> Figures:
 
 def drive_from_first_start(env: CorridorEnv, choose: Chooser, actions: int = ACTIONS) -> Trace:
     """The one drive that tells whether a first lap is driven (`traces.first_lap`)."""
-    return drive(env, choose, 0, first_start(env.robot.world), actions)
+    return drive(env, choose, [first_start(env.robot.world)], actions)[0]
 
 
-def drive(env: CorridorEnv, choose: Chooser, number: int, pose: Pose, actions: int) -> Trace:
-    """Drive this many actions from a pose. After a bump the driver recovers as always.
+def drive(env: CorridorEnv, choose: Chooser, poses: Sequence[Pose], actions: int) -> list[Trace]:
+    """Drive from several poses side by side, as if each robot were the only one.
+
+    The robots act in turn, in one scene, and none is in another's way. What one does depends only
+    on its pose, its number among the poses, which seeds its draws, and who drives.
 
     Args:
-        env: Without a wrapper.
+        env: Without a wrapper. Its own robot drives from the first pose, twins from the others.
         choose: Who drives.
-        number: Seeds the draws of recoveries and of `choose`.
-        pose: Where to begin, standing.
-        actions: How many, at least 1.
+        poses: Where to begin, standing.
+        actions: How many from each pose, at least 1. After a bump the driver recovers as always.
+
+    Returns:
+        A trace for each pose.
+
+    Raises:
+        ValueError: A pose is inside a wall.
     """
-    observation: Observation = env.reset(seed=number, options={"pose": pose})[1]["observation"]
-    draw = generator(SEED, "action", number)
-    bumps, way_m = np.zeros(actions, np.bool_), np.zeros(actions)
-    poses = np.zeros((actions + 1, 3))
-    poses[0] = pose.x_m, pose.y_m, pose.heading_rad
-    for i in range(actions):
-        _, _, bumps[i], _, info = env.step(np.int64(choose(observation, draw)))
-        reached = env.robot.pose
-        way_m[i] = math.hypot(reached.x_m - poses[i, 0], reached.y_m - poses[i, 1])
-        if bumps[i]:
-            _, info = env.reset()
-        observation = info["observation"]
-        poses[i + 1] = observation.x_m, observation.y_m, observation.heading_rad
-    laps = env.robot.laps
-    return Trace(
-        world=env.robot.world.name,
-        bumps=bumps,
-        places_m=poses[:, :2],
-        headings_rad=poses[:, 2],
-        way_m=way_m,
-        laps_left=laps.left,
-        laps_right=laps.right,
-    )
+    with ExitStack() as twins:
+        drives: list[_Drive] = []
+        for number, pose in enumerate(poses):
+            own = twins.enter_context(_twin(env)) if number else env
+            drives.append(_Drive(own, number, pose, actions))
+        draws = [each.draw for each in drives]
+        for i in range(actions):
+            chosen = choose([each.observation for each in drives], draws)
+            for each, action in zip(drives, chosen, strict=True):
+                each.act(i, action)
+        return [each.trace() for each in drives]
+
+
+def _twin(env: CorridorEnv) -> CorridorEnv:
+    """Another robot in the same scene."""
+    return CorridorEnv(config=env.config, robot=env.robot.twin())
+
+
+class _Drive:
+    """One robot on its drive, and what happened so far."""
+
+    def __init__(self, env: CorridorEnv, number: int, pose: Pose, actions: int) -> None:
+        self._env = env
+        info = env.reset(seed=number, options={"pose": pose})[1]
+        self.observation: Observation = info["observation"]
+        """What the next action is chosen by."""
+        self.draw = generator(SEED, "action", number)
+        """Draws of who drives."""
+        self._bumps, self._way_m = np.zeros(actions, np.bool_), np.zeros(actions)
+        self._poses = np.zeros((actions + 1, 3))
+        self._poses[0] = pose.x_m, pose.y_m, pose.heading_rad
+
+    def act(self, i: int, action: int) -> None:
+        """Carry out action number `i`, recovery included."""
+        _, _, self._bumps[i], _, info = self._env.step(np.int64(action))
+        reached, before = self._env.robot.pose, self._poses[i]
+        self._way_m[i] = math.hypot(reached.x_m - before[0], reached.y_m - before[1])
+        if self._bumps[i]:
+            _, info = self._env.reset()
+        self.observation = seen = info["observation"]
+        self._poses[i + 1] = seen.x_m, seen.y_m, seen.heading_rad
+
+    def trace(self) -> Trace:
+        """The whole drive."""
+        laps = self._env.robot.laps
+        return Trace(
+            world=self._env.robot.world.name,
+            bumps=self._bumps,
+            places_m=self._poses[:, :2],
+            headings_rad=self._poses[:, 2],
+            way_m=self._way_m,
+            laps_left=laps.left,
+            laps_right=laps.right,
+        )

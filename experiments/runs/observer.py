@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 
 from experiments.drives import routes
-from experiments.drives.choosers import greedy
+from experiments.drives.choosers import greedy, side_by_side
 from experiments.drives.frozen_drives import drive_from_first_start, evaluate
 from experiments.drives.references import DRIVERS, reference
 from experiments.drives.tour import drive_tour
@@ -38,7 +38,10 @@ class Observer:
 
     def __init__(self, plan: Plan, folder: Path, config: Config) -> None:
         self._plan, self._folder, self._config = plan, folder, config
-        self._network = Predictor(config.network, config.numerics.actor)
+        actor = config.numerics.actor
+        self._network = Predictor(config.network, actor)
+        self._network_of_many = Predictor(config.network, side_by_side(actor))
+        """The same for robots that drive side by side."""
         self._envs: dict[str, CorridorEnv] = {}
         self._shown = b""
 
@@ -46,6 +49,7 @@ class Observer:
         """Look at these weights, safetensors bytes, from now on. Raises ValueError on a misfit."""
         if weights != self._shown:
             self._network.load(0, weights)
+            self._network_of_many.load(0, weights)
             self._shown = weights
 
     def evaluate(self, world: str, now: Row, *, over: bool) -> None:
@@ -62,7 +66,7 @@ class Observer:
         actions = settings.actions if over else settings.every_length
         rows = []
         for each in (settings.worlds if over else ()) or (world,):
-            done = evaluate(self._env(each), greedy(self._network), starts, actions)
+            done = evaluate(self._env(each), greedy(self._network_of_many), starts, actions)
             rows.append(_row(label, "network", each, done.figures, now))
         append_csv(self._folder / EVALUATIONS, EVALUATION_COLUMNS, rows)
 

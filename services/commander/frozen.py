@@ -9,7 +9,7 @@ from pathlib import Path
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as save_safetensors
 
-from shared.config import ActorNumerics, NetworkConfig
+from shared.config import ActorNumerics, NetworkConfig, Numerics
 from shared.errors import ConfigError, StateError
 from shared.rl.predictor import Predictor
 from shared.settings import FILE_NAME
@@ -30,13 +30,13 @@ class Frozen:
     episode: int | None = None
     train_steps: int | None = None
 
-    def predictor(self, network: NetworkConfig) -> Predictor:
-        """The network ready to predict, with the same arithmetic as in its run.
+    def predictor(self, network: NetworkConfig, numerics: Numerics | None = None) -> Predictor:
+        """The network ready to predict: one image at a time unless `numerics` tell otherwise.
 
         Raises:
             ConfigError: It is not of this shape.
         """
-        predictor = Predictor(network, ActorNumerics())
+        predictor = Predictor(network, numerics or ActorNumerics())
         try:
             predictor.load(0, self.data)
         except ValueError as error:

@@ -8,6 +8,7 @@ something is placed or removed, another scene is built.
 
 from __future__ import annotations
 
+import copy
 import math
 import tempfile
 from collections.abc import Sequence
@@ -63,7 +64,8 @@ class Scene:
     ) -> None:
         obstacles = world.obstacles if obstacles is None else obstacles
         self._camera = camera
-        self._closed = False
+        self._users = {self}
+        """This scene and those it is `shared` with, as long as they are not closed."""
         # Apart, because the renderer would draw solid bodies as well.
         self._solid, self._seen = _connect(), _connect()
         self._obstructions = self._add_solids(
@@ -114,10 +116,24 @@ class Scene:
         pixels = np.asarray(picture, np.uint8).reshape(height, width, 4)
         return np.ascontiguousarray(pixels[:, :, :3])
 
+    def shared(self) -> Scene:
+        """The same scene for one more user, to be closed by them; it takes no memory to speak of.
+
+        Raises:
+            ValueError: It is closed.
+        """
+        if self not in self._users:
+            raise ValueError("a closed scene cannot be shared")
+        other = copy.copy(self)
+        self._users.add(other)
+        return other
+
     def close(self) -> None:
-        """Free everything. May be called twice."""
-        if not self._closed:
-            self._closed = True
+        """Free everything once nobody uses it any more. May be called twice."""
+        if self not in self._users:
+            return
+        self._users.remove(self)
+        if not self._users:
             pybullet.disconnect(**self._solid)
             pybullet.disconnect(**self._seen)
 

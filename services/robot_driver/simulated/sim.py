@@ -8,9 +8,11 @@ obstacles placed and removed, or another world put in its place.
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -223,6 +225,16 @@ class SimRobot(Robot):
         self._pose, self._velocity = pose, velocity
         self._time_s = time_s
         self._laps = LapCounter(winding_rad, lap_start_rad, left, right)
+
+    def twin(self) -> SimRobot:
+        """Another robot in the same state, that drives on by itself; neither meets the other.
+
+        Both ask one scene as long as the world of neither is changed, and each is to be closed.
+        """
+        twin = copy.copy(self)
+        twin._scene = self._scene.shared()
+        twin._laps = replace(self._laps)
+        return twin
 
     def close(self) -> None:
         """Free the simulation. May be called twice."""
