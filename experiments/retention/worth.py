@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import islice
 
-from experiments.drives.choosers import greedy
+from experiments.drives.choosers import greedy, side_by_side
 from experiments.drives.frozen_drives import evaluate
 from experiments.drives.traces import Figures
 from experiments.environment import CorridorEnv, with_world
@@ -57,7 +57,7 @@ def driven(
     weights: bytes, config: Config, worlds: Sequence[str], starts: int, actions: int
 ) -> dict[str, Figures]:
     """Let a frozen network drive in worlds; return the figures of each."""
-    network = Predictor(config.network, config.numerics.actor)
+    network = Predictor(config.network, side_by_side(config.numerics.actor))
     network.load(1, weights)
     found = {}
     for world in worlds:
