@@ -77,6 +77,15 @@ def test_more_than_one_block_gives_the_same(seed: int) -> None:
     assert older_of_most_alike(hamming(drawn), n, count).tolist() == sorted(expected)
 
 
+def test_a_sample_whose_nearest_has_gone_is_as_far_as_its_next() -> None:
+    numbers = [0, 0b1111, 0b111111, 0xFFFF00, 0xFFF800 | 0b11]
+    packed = np.array([list(number.to_bytes(3, "big")) for number in numbers], np.uint8)
+    distances = hamming(packed)(np.arange(5), 0)
+    assert [distances[i, j] for i, j in ((1, 2), (0, 1), (0, 2))] == [2, 4, 6]
+    assert distances[3, 4] == 5
+    assert older_of_most_alike(hamming(packed), 5, 2).tolist() == [1, 3]
+
+
 def test_coverage_describes_anew_what_other_weights_described() -> None:
     memory, network = memory_of([bytes([i] * 15) for i in range(32)]), FakePredictor()
     removed(memory, "coverage", network)
