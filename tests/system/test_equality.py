@@ -13,13 +13,13 @@ from comparison import Outcome, assert_equal, distributed, single_process
 
 from shared.config import Config
 
-EPISODES = 62
+EPISODES = 40
 pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]
 
 
 @pytest.fixture(scope="module")
 def config() -> Config:
-    """Everything that changes memory or weights happens within 62 episodes.
+    """Everything that changes memory or weights happens within 40 episodes.
 
     Discards, growth and then a higher threshold, marks by decree, target copies, and after so many
     actions equalisation and fitting phases. What the network learns differs between processors, so

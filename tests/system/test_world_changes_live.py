@@ -16,7 +16,7 @@ from shared.inbox import Inbox
 from shared.keys import OBSERVATION, ROBOT_STATE, ROBOT_WORLD
 from shared.messages import Box, Observation, RobotState, WorldChange, WorldChanged
 
-EPISODES = 40
+EPISODES = 26
 pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
 IN_THE_CORNER = ["--x", "4.88", "--y", "3.08", "--length", "0.04", "--width", "0.04"]
 """Where no robot can be."""
@@ -140,14 +140,14 @@ def scheduled() -> list[WorldChange]:
     box = {"x_m": 3.8, "y_m": 1.6, "length_m": 0.5, "width_m": 0.3, "height_m": 0.4}
     return [
         WorldChange(kind="place", box=Box(name="first", rgb=(200, 30, 30), **box)),
-        WorldChange(kind="switch", world="minus", at_episode=8),
-        WorldChange(kind="switch", world="plus", start=2, at_episode=20),
+        WorldChange(kind="switch", world="minus", at_episode=5),
+        WorldChange(kind="switch", world="plus", start=2, at_episode=13),
         WorldChange(
             kind="place",
-            at_episode=21,
+            at_episode=14,
             box=Box(name="b2", rgb=(0, 0, 90), **{**box, "y_m": -2.0, "heading_deg": 30.0}),
         ),
-        WorldChange(kind="remove", name="b2", at_episode=30),
+        WorldChange(kind="remove", name="b2", at_episode=20),
     ]
 
 
@@ -165,10 +165,10 @@ def test_a_run_with_scheduled_changes_equals_the_single_process_loop(
             answer = cluster.bus.request(ROBOT_WORLD, change, WorldChanged, ident="robotino1")
             assert answer.accepted, answer.reason
         cluster.start("replay", "learner", "actor")
-        cluster.wait_episodes(12, 200)
+        cluster.wait_episodes(8, 200)
         cluster.stop_all()
         cluster.start(*ALL)
-        cluster.wait_episodes(25, 200)
+        cluster.wait_episodes(16, 200)
         cluster.kill("replay")
         cluster.start("replay")
         cluster.wait_episodes(EPISODES, 200)
