@@ -30,6 +30,37 @@ class Expected(Section):
     """Experiments whose highest mean fitness is lower."""
 
 
+class Claim(Section):
+    """Something that the thesis says of an experiment, and the figure of a seed that shows it."""
+
+    text: str
+    source: str
+    """Where the thesis says it."""
+    figure: Literal[
+        "bumps-beside",
+        "rarer-direction",
+        "unbalance",
+        "lowest-fitness",
+        "kept",
+        "samples-beside",
+        "highest-threshold",
+        "highest-capacity",
+        "clean-tours",
+        "fitness-beside",
+    ]
+    """What is measured: the names of `experiments/report/claims.py`."""
+    others: Names = ()
+    """Experiments that it is measured beside, with the same seed."""
+    stage: str = ""
+    """The stage at whose end frozen networks drive."""
+    worlds: Names = ()
+    """Where they drive, or the corridors whose samples are counted."""
+    least: float | None = None
+    """The claim holds in a seed whose figure is at least this."""
+    most: float | None = None
+    """And at most this."""
+
+
 class Comparison(Section):
     """A comparison with other experiments. It is shown where all of them were run."""
 
@@ -83,6 +114,7 @@ class Presentation(Section):
     `probes-best-<world>`, `probes-last-<world>`."""
     expected: Expected = Expected()
     comparisons: Annotated[tuple[Comparison, ...], Field(strict=False)] = ()
+    claims: Annotated[tuple[Claim, ...], Field(strict=False)] = ()
 
 
 INHERITED = ("groups", "table", "full_scale")

@@ -38,11 +38,15 @@ def gradient_steps(plan: Plan) -> int:
     for index, stage in enumerate(plan.stages):
         config = stage_config(plan, index, seed=1)
         learning = config.learning
-        every = learning.fit_every
+        counts_actions = plan.counted_in == "actions"
+        every = learning.fit_every_actions if counts_actions else learning.fit_every
         fits = stage.until // every - start // every if every else 0
         batches = learning.fit_epochs * -(-config.memory.capacity // learning.batch_size)
         total += fits * batches
-        total += (stage.until - start - fits) * learning.mini_batches_per_episode
+        episodes = stage.until - start
+        if counts_actions and learning.mini_batches_per_episode:
+            episodes = round(episodes / episode_actions(plan))
+        total += (episodes - fits) * learning.mini_batches_per_episode
         start = stage.until
     return total
 
@@ -117,6 +121,8 @@ def _actions(plan: Plan, full: Experiment | None) -> tuple[float, str]:
         return float(np.median([run.actions for run in complete])), "our runs, full"
     if told := plan.thesis.get("actions"):
         return told, "thesis"
+    if plan.counted_in == "actions":
+        return plan.stages[-1].until, "the plan"
     if length := episode_actions(plan):
         return length * plan.stages[-1].until, f"episodes of {length:.0f} actions"
     return 0.0, ""

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from experiments.plans.plan import PLANS, presentations
 from experiments.report import run_folder
+from experiments.report.claims import claims_sections
 from experiments.report.comparisons import compare_all
 from experiments.report.document import Section, html, markdown, write_pictures
 from experiments.report.overview import overview
@@ -53,7 +54,7 @@ def all_sections(
     gpu_step_ms: float | None = None,
     plans: Traversable = PLANS,
 ) -> list[Section]:
-    """The overview, the comparisons by scale, and every experiment; nothing is drawn yet.
+    """The overview, the thesis's claims, comparisons, every experiment; nothing is drawn yet.
 
     Args:
         experiments: What was run.
@@ -63,6 +64,7 @@ def all_sections(
     shown = presentations({experiment.name for experiment in experiments}, plans)
     return [
         overview(experiments, gpu_step_ms, plans),
+        *claims_sections(experiments, shown),
         *compare_all(experiments, shown),
         *(section_of(experiment, shown[experiment.name]) for experiment in experiments),
     ]

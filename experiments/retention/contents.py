@@ -18,6 +18,9 @@ from shared.rl.retention.strategy import strategy
 from shared.rl.schedule import due
 from shared.rl.turn import maintain
 
+MOST_COMPARED = 4500
+"""Samples whose distances are looked at: as many as a memory of the tenth scale holds."""
+
 
 @dataclass
 class Costs:
@@ -37,6 +40,8 @@ class Mark:
     stage: str
     memory: ReplayMemory
     costs: Costs
+    network: Predictor
+    """The one in force then."""
 
 
 def managed(
@@ -76,7 +81,7 @@ def managed(
         if due(turn.now, 0, refresh_every):
             refresher.refresh(memory, network)
         if stage := ends.get(turn.now.episode):
-            yield Mark(stage, memory, costs)
+            yield Mark(stage, memory, costs, network)
 
 
 def figures(mark: Mark, config: Config) -> dict[str, float]:
@@ -84,6 +89,7 @@ def figures(mark: Mark, config: Config) -> dict[str, float]:
 
     Returns:
         share_<world>, share_<action>: parts of the samples.
+        nearest_bits: mean distance of a descriptor from the most similar other one, of 120 bits.
         age: mean age in memories: 1 is a sample that came N samples ago.
         last_resort: part of what was removed that went by age for want of candidates.
         discard_ms: mean processor time of a discard.
@@ -100,8 +106,20 @@ def figures(mark: Mark, config: Config) -> dict[str, float]:
         "samples": count,
         **{f"share_{name}": float(s) for name, s in zip(memory.worlds, worlds, strict=True)},
         **{f"share_{name}": float(s) for name, s in zip(SHORT_NAMES, actions, strict=True)},
+        "nearest_bits": _nearest_bits(mark),
         "age": float(ages.mean()),
         "last_resort": costs.last_resort / max(costs.removed, 1),
         "discard_ms": 1000.0 * costs.seconds / max(costs.discards, 1),
         "column_bytes": own.itemsize - 8,
     }
+
+
+def _nearest_bits(mark: Mark) -> float:
+    """Mean Hamming distance to the nearest other sample of the memory, or of 4,500 of them."""
+    memory = mark.memory
+    some = np.linspace(0, len(memory) - 1, min(len(memory), MOST_COMPARED)).astype(np.int64)
+    parts = [mark.network.descriptors(images) for _, images in memory.parts(some)]
+    signs = np.unpackbits(np.concatenate(parts), axis=1).astype(np.float32) * 2.0 - 1.0
+    products = signs @ signs.T
+    np.fill_diagonal(products, -np.inf)
+    return float((signs.shape[1] - products.max(axis=1)).mean() / 2.0)

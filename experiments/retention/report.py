@@ -33,7 +33,7 @@ from experiments.report.ratios import (
 )
 from experiments.retention.benchmark import Benchmark, load_benchmark
 from experiments.retention.work import Measured, Network
-from experiments.verdicts import Floats, interquartile_mean, max_t
+from experiments.verdicts import Floats, interquartile_mean, log_rates, max_t
 from shared.errors import StateError
 
 KEPT = "retention.json.xz"
@@ -105,6 +105,7 @@ def _table(measured: Sequence[Measured], setting: str, mark: str, benchmark: Ben
                 *(number(interquartile_mean(values)) for values in bumps),
                 " / ".join(shares),
                 number(_mean(networks, "age")),
+                number(_mean(networks, "nearest_bits")),
                 f"{100 * _mean(networks, 'last_resort'):.1f}",
                 number(_mean(networks, "discard_ms")),
                 f"{_mean(networks, 'column_bytes'):.0f}",
@@ -112,8 +113,8 @@ def _table(measured: Sequence[Measured], setting: str, mark: str, benchmark: Ben
         )
     header = (
         "kept by", "seeds", *(f"bumps per 1,000 in {world}" for world in benchmark.worlds),
-        f"samples of {' / '.join(benchmark.worlds)} (%)", "age (N)", "last resort (%)",
-        "ms a discard", "bytes a sample",
+        f"samples of {' / '.join(benchmark.worlds)} (%)", "age (N)", "nearest other (bits)",
+        "last resort (%)", "ms a discard", "bytes a sample",
     )  # fmt: skip
     title = f"What was kept at the end of {mark}, and how networks drive that learned from it"
     return Table(f"retention-{setting}-{mark}", f"{title} ({setting})", header, tuple(rows))
@@ -133,7 +134,7 @@ def _verdicts(measured: Sequence[Measured], setting: str, benchmark: Benchmark) 
     title = f"RMM beside the other primary entries in Plus, after Minus ({setting})"
     blocks: list[Block] = [
         ratio_table(f"{name}-verdicts", title, found),
-        Findings((*told(found), *_not_judged(measured, benchmark))),
+        Findings((*told(found), *_chance(measured), *_not_judged(measured, benchmark))),
         Picture(
             f"{name}-ratios", title, "Bumps of RMM divided by those of the other, seed by seed.",
             partial(ratio_figure, found),
@@ -161,6 +162,23 @@ def _explored(names: Sequence[str], drives: Mapping[str, Drives], setting: str) 
         for row, each in zip(table.rows, found, strict=True)
     )
     return Table(table.name, table.title, table.header, rows)
+
+
+def _chance(measured: Sequence[Measured]) -> list[str]:
+    """How much networks of one memory differ, by chance in learning alone."""
+    gaps = []
+    for each in measured:
+        own = [n.drives[FIRST_WORLD] for n in each.networks if n.mark == BETWEEN]
+        if len(own) > 1:
+            counts = np.array([(drive["bumps"], drive["actions"]) for drive in own])
+            gaps.append(float(np.std(log_rates(counts[:, 0], counts[:, 1]), ddof=1)))
+    if not gaps:
+        return []
+    spread = float(np.sqrt(np.mean(np.square(gaps))))
+    return [
+        f"Networks that learn from the same memory differ by a factor of {number(np.exp(spread))} "
+        f"(one standard deviation, {len(gaps)} memories), by chance in learning alone."
+    ]
 
 
 def _not_judged(measured: Sequence[Measured], benchmark: Benchmark) -> list[str]:

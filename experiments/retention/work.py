@@ -10,7 +10,7 @@ Run again, it goes on: what is measured is left alone, and a recording continues
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import get_args
 
@@ -20,6 +20,7 @@ from experiments.plans.plan import Plan, stage_config
 from experiments.plans.scales import load_plan
 from experiments.retention.benchmark import Benchmark, Entry, Setting, Work, config_of
 from experiments.retention.contents import Mark, figures, managed
+from experiments.retention.offline import selected
 from experiments.retention.refresh import Refresher
 from experiments.retention.stream import Recorder, Stream
 from experiments.retention.worth import driven, learned
@@ -125,11 +126,10 @@ def _measured(benchmark: Benchmark, work: Work, stream: Stream, out: Path) -> Me
         for stage in info.stages
         if stage.last_episode is not None and stage.name in marks
     }
-    refresher = Refresher(entry.refresh, stream, config, _losses(_run_folder(setting, seed, out)))
-    every = round(entry.refresh_every * config.memory.capacity)
+    losses = _losses(_run_folder(setting, seed, out))
     networks = [
         network
-        for mark in managed(stream, config, config.numerics.replay, ends, refresher, every)
+        for mark in _marks(entry, stream, config, ends, losses)
         for network in _networks(benchmark, entry, mark, config)
     ]
     made = made_here()
@@ -142,6 +142,22 @@ def _measured(benchmark: Benchmark, work: Work, stream: Stream, out: Path) -> Me
         commit=str(made["commit"]),
         machine=str(made["machine"]),
     )
+
+
+def _marks(
+    entry: Entry,
+    stream: Stream,
+    config: Config,
+    ends: Mapping[int, str],
+    losses: Mapping[int, float],
+) -> Iterator[Mark]:
+    """The memories of an entry at the ends of stages."""
+    numerics = config.numerics.replay
+    if entry.offline is not None:
+        return selected(stream, config, numerics, ends, entry.offline)
+    refresher = Refresher(entry.refresh, stream, config, losses)
+    every = round(entry.refresh_every * config.memory.capacity)
+    return managed(stream, config, numerics, ends, refresher, every)
 
 
 def _losses(run: Path) -> dict[int, float]:

@@ -20,10 +20,10 @@ def test_the_command_writes_pages_that_need_nothing_else(
         write_run(tmp_path / "runs", name, 1)
     out = tmp_path / "out"
     assert main(["report", str(tmp_path / "runs"), "--out", str(out), "--gpu-step-ms", "3"]) == 0
-    assert "report.html and 4 Markdown pages" in capsys.readouterr().out
+    assert "report.html and 5 Markdown pages" in capsys.readouterr().out
     page = (out / "report.html").read_text()
     assert set(re.findall(r'(?:src|href)="([^"]{0,10})', page)) == {
-        "data:image", "#runs", "#policy-ep", "#policy-ro", "#compariso",
+        "data:image", "#runs", "#policy-ep", "#policy-ro", "#compariso", "#claims-te",
     }  # fmt: skip
     for path in out.glob("*.md"):
         for picture in re.findall(r"\]\((figures/[^)]+)\)", path.read_text()):

@@ -81,6 +81,31 @@ def test_what_goes_by_age_is_not_judged() -> None:
     assert "quotas discards 15 % by age for want of candidates" in " ".join(told)
 
 
+def test_chance_in_learning_is_told_where_two_networks_learned_from_one_memory() -> None:
+    found = results(rmm=10.0, normm=100.0)
+    twice = [
+        each.model_copy(
+            update={
+                "networks": tuple(
+                    again
+                    for network in each.networks
+                    for again in (
+                        network,
+                        result("rmm", 1, 21.5)
+                        .networks[0]
+                        .model_copy(update={"mark": network.mark, "number": 2}),
+                    )
+                )
+            }
+        )
+        for each in found
+        if (each.entry, each.seed) == ("rmm", 1)
+    ]
+    told = [s for block in blocks([*found[1:], *twice], Findings) for s in block.sentences]
+    # log(22 / 10.5) between the two, over the square root of 2
+    assert any("differ by a factor of 1.69 (one standard deviation, 1 memories)" in s for s in told)
+
+
 def test_one_seed_is_shown_and_not_judged() -> None:
     found = [result("rmm", 1, 3.0), result("normm", 1, 5.0)]
     assert {table.name for table in blocks(found, Table)} == {
