@@ -87,7 +87,7 @@ class Plan:
 
 
 CHECK = Plan(
-    (1, 2), 4, 90, max_samples=60, fit_every=5, mini_batches=1, actions=150, starts=2,
+    (1,), 4, 90, max_samples=60, fit_every=5, mini_batches=1, actions=150, starts=2,
     drive_actions=80,
 )  # fmt: skip
 
