@@ -16,15 +16,15 @@ from experiments.runs.schedule import shares_of
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
 
-DEMO = ("experiment", "demo", "--scale", "tenth", "--seeds", "2", "--jobs", "2")
+PLAN = ("experiment", "real-corridor", "--scale", "tenth", "--seeds", "2", "--jobs", "2")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_seeds_side_by_side_divide_the_cores_and_save_what_they_did(
     number: signal.Signals, tmp_path: Path
 ) -> None:
-    command = [sys.executable, "-m", "services.cli", *DEMO, "--out", str(tmp_path)]
-    runs = [tmp_path / "demo-tenth" / f"seed-{seed}" for seed in (1, 2)]
+    command = [sys.executable, "-m", "services.cli", *PLAN, "--out", str(tmp_path)]
+    runs = [tmp_path / "real-corridor-tenth" / f"seed-{seed}" for seed in (1, 2)]
     with subprocess.Popen(
         command,
         stdout=subprocess.PIPE,
