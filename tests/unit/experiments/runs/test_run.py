@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from functools import partial
 from pathlib import Path
 
@@ -152,10 +153,17 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return base / "x"
 
 
+def with_references(finished: Path, folder: Path) -> Path:
+    """A folder with the drives of chance and planner, which take longest and never change."""
+    shutil.copytree(finished.parent / "references", folder / "references")
+    return folder
+
+
 def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(
     finished: Path, tmp_path: Path
 ) -> None:
     """A46, and equal seeds give equal figures in every column but the wall time."""
+    with_references(finished, tmp_path)
     one, two = tmp_path / "y" / "one", tmp_path / "y" / "two"
     assert not run(FIRST, one, turns=2)  # while the memory is being filled
     assert not run(FIRST, one, turns=6)
@@ -168,8 +176,9 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(
             assert (folder / weights).read_bytes() == (finished / name / weights).read_bytes()
 
 
-def test_a_memory_that_has_grown_is_as_large_after_a_stop(tmp_path: Path) -> None:
+def test_a_memory_that_has_grown_is_as_large_after_a_stop(finished: Path, tmp_path: Path) -> None:
     """A44: the configured capacity counts as its stage begins, not as the run goes on."""
+    with_references(finished, tmp_path)
     whole, parted = tmp_path / "whole" / "growing", tmp_path / "parted" / "growing"
     assert run(GROWING, whole)
     for episodes in (4, 5, 6):
@@ -180,8 +189,9 @@ def test_a_memory_that_has_grown_is_as_large_after_a_stop(tmp_path: Path) -> Non
     assert capacities == [60] * 3 + [250] * 4
 
 
-def test_a_plan_that_counts_actions_does_all_by_them(tmp_path: Path) -> None:
+def test_a_plan_that_counts_actions_does_all_by_them(finished: Path, tmp_path: Path) -> None:
     """E39: stages, fitting phases, equalisation and changes, however long episodes are."""
+    with_references(finished, tmp_path)
     whole, parted = tmp_path / "whole" / "counting", tmp_path / "parted" / "counting"
     assert run(COUNTING, whole)
     assert not run(COUNTING, parted, turns=4)

@@ -279,7 +279,8 @@ def test_a_robot_without_a_world_refuses_changes_and_names_the_configured_world(
 def test_waiting_changes_are_bounded() -> None:
     driver, _ = make_driver()
     for i in range(MAX_PENDING):
-        assert driver.change(switch(at_episode=i + 1)).accepted
+        wish = gone("box", i + 1) if i % 2 else box(at_episode=i + 1)
+        assert driver.change(wish).accepted
     answer = driver.change(switch(at_episode=1))
     assert (answer.accepted, answer.pending) == (False, MAX_PENDING)
     assert answer.reason == f"{MAX_PENDING} changes wait already"
