@@ -32,21 +32,18 @@ demo: $(VENV)/.all ## install what is needed, then run the demo until Ctrl-C
 	@$(BIN)/corridor up --preset demo $(ARGS)
 
 # Four at a time: most tests that take long wait for something.
-test: check ## all checks and tests but the slow ones
+test: $(VENV)/.dev ## all checks and tests but the slow ones
 	$(PYTEST) $(BESIDE) -m "not slow" tests
 
-test-full: check ## all checks and tests
+test-full: $(VENV)/.dev ## all checks and tests
 	$(PYTEST) -n 2 tests/unit tests/repository tests/contract
 	$(PYTEST) tests/system tests/learning
 
-check: lint ## style, types, dependency rules
-	$(BIN)/mypy
-	$(BIN)/lint-imports
+check: $(VENV)/.dev ## style, types, dependency rules
+	$(BIN)/python -m tests.checks
 
 lint: $(VENV)/.dev ## style only
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-	$(BIN)/mdformat --check README.md benchmarks/results.md $(filter-out docs/results.md,$(wildcard docs/*.md))
+	$(BIN)/python -m tests.checks --style
 
 unit: $(VENV)/.dev ## fast tests
 	$(PYTEST) $(BESIDE) -m "not slow" tests/unit tests/repository tests/contract
