@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from textwrap import dedent
 from typing import Any
 
 import pytest
@@ -15,36 +17,47 @@ from services.robot_driver.driver import Driver
 from services.robot_driver.kinds import make_robot
 from shared import statefile
 from shared.config import Config
-from shared.service import StopFlag, Stopped, answer_signals, starting
+from shared.service import Stopped
+
+BEGIN = """
+import signal
+from shared.service import StopFlag, answer_signals, starting
+"""
 
 
-@pytest.fixture
-def _signals_as_before() -> Iterator[None]:
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
-    yield
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
+def in_its_own_process(code: str) -> None:
+    """Run a test that sends itself a signal: a process that tests share may not survive it."""
+    done = subprocess.run(
+        [sys.executable, "-c", BEGIN + dedent(code)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.usefixtures("_signals_as_before")
 def test_sigterm_waits_until_the_service_can_answer_it() -> None:
-    stop = StopFlag()
-    with starting():
-        signal.raise_signal(signal.SIGTERM)
-        assert not stop.is_set()
-        answer_signals(stop)
-        assert stop.is_set()
-    assert stop.reason == "SIGTERM"
+    in_its_own_process(
+        """
+        stop = StopFlag()
+        with starting():
+            signal.raise_signal(signal.SIGTERM)
+            assert not stop.is_set()
+            answer_signals(stop)
+            assert stop.is_set()
+        assert stop.reason == "SIGTERM"
+        """
+    )
 
 
-@pytest.mark.usefixtures("_signals_as_before")
 def test_what_an_earlier_start_held_back_is_forgotten() -> None:
-    with starting():
-        signal.raise_signal(signal.SIGTERM)
-    stop = StopFlag()
-    with starting():
-        answer_signals(stop)
-    assert not stop.is_set()
+    in_its_own_process(
+        """
+        with starting():
+            signal.raise_signal(signal.SIGTERM)
+        stop = StopFlag()
+        with starting():
+            answer_signals(stop)
+        assert not stop.is_set()
+        """
+    )
 
 
 def test_a_driver_stopped_before_it_is_up_keeps_what_it_was_to_continue(

@@ -1,33 +1,31 @@
-"""Signals that end `corridor up`."""
+"""Signals that end `corridor up`, each in a process of its own."""
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Iterator
+import subprocess
+import sys
 
 import pytest
 
+CODE = """
+import signal
 from services.launcher.up import stop_on_signals
+before = signal.{before}
+signal.signal(signal.SIGHUP, before)
+with stop_on_signals() as stop:
+    signal.raise_signal(signal.SIGHUP)
+    assert stop.wait({wait_s}) is {stops}
+assert signal.getsignal(signal.SIGHUP) is before
+"""
 
 
-@pytest.fixture(autouse=True)
-def _handlers_as_before() -> Iterator[None]:
-    before = signal.getsignal(signal.SIGHUP)
-    yield
-    signal.signal(signal.SIGHUP, before)
-
-
-def test_a_closed_terminal_stops_a_run_and_handlers_are_put_back() -> None:
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    with stop_on_signals() as stop:
-        signal.raise_signal(signal.SIGHUP)
-        assert stop.wait(5.0)
-    assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
-
-
-def test_under_nohup_a_run_outlives_its_terminal() -> None:
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    with stop_on_signals() as stop:
-        signal.raise_signal(signal.SIGHUP)
-        assert not stop.is_set()
-    assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+@pytest.mark.parametrize(
+    ("before", "stops", "wait_s"),
+    [("SIG_DFL", True, 5.0), ("SIG_IGN", False, 0.1)],
+    ids=["a closed terminal stops a run", "under nohup a run outlives its terminal"],
+)
+def test_a_closed_terminal(before: str, stops: bool, wait_s: float) -> None:
+    """And handlers are put back."""
+    code = CODE.format(before=before, stops=stops, wait_s=wait_s)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
