@@ -39,7 +39,7 @@ class Paired:
     bound: float
     """The upper end of the one-sided 95 % interval."""
     p: float
-    """Of the sign-flip permutation test, two-sided."""
+    """The p value of the sign-flip permutation test, two-sided."""
     seeds: int
     needed: int
     """Seeds with which the interval would be narrow enough to decide, at this mean and spread."""

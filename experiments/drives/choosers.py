@@ -97,7 +97,7 @@ class Planned:
             world, ActionGeometry.of(robot), cell_m=GRID_M, headings=HEADINGS, horizon=HORIZON
         )
         self._plans: dict[int, _Plan] = {}
-        """By the robot's place in the order."""
+        """Plans, by the robot's place in the order."""
 
     def __call__(
         self,

@@ -22,7 +22,7 @@ Distances = Callable[[Ranks, int], npt.NDArray[Any]]
 """(ranks of k samples, start) -> their distances from all samples of rank `start` on, as floats
 [k, n - start] of at most `FAR`. The array is overwritten."""
 FAR = np.float32(1e30)
-"""Of samples that must not be compared."""
+"""The distance of samples that must not be compared."""
 ROWS = 512
 """Samples compared with all newer ones at a time."""
 
