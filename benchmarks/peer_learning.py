@@ -98,14 +98,7 @@ class Ours:
 
     def _store(self, episode: Episode) -> None:
         commit, self._counters = numbering.accept(self._counters, self.config.memory, episode)
-        rows, images = sample_rows(
-            episode,
-            self._memory.worlds,
-            first_id=commit.first_id,
-            commit=commit.commit,
-            number=commit.episode,
-            stored=commit.stored,
-        )
+        rows, images = sample_rows(episode, self._memory.worlds, commit)
         self._memory.append(rows, images)
         if self.trainer.apply_target_rule(commit.episode, episode.bump):
             self._publish()

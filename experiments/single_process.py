@@ -102,14 +102,7 @@ class SingleProcess:
         """Append -> discard -> equalise -> train or fit -> target rule -> publish (E25)."""
         config = self.config
         commit, self.counters = numbering.accept(self.counters, config.memory, episode)
-        rows, images = sample_rows(
-            episode,
-            self.memory.worlds,
-            first_id=commit.first_id,
-            commit=commit.commit,
-            number=commit.episode,
-            stored=commit.stored,
-        )
+        rows, images = sample_rows(episode, self.memory.worlds, commit)
         self.memory.append(rows, images)
         now = Moment(commit.episode, self.counters.actions, episode.actions)
         maintenance = maintain(self.memory, now, config.memory, self.judging, config.run.seed)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from experiments.report.document import Table
-from experiments.report.figures.style import GREY, INK, sheet, styled
+from experiments.report.figures.style import GREY, INK, label_rows, sheet, styled
 from experiments.report.measures import number
 from experiments.report.run_folder import Experiment
 from experiments.verdicts import MARGIN, Floats, Paired, holm, log_rates, paired
@@ -131,9 +131,6 @@ def ratio_figure(found: Sequence[Ratio]) -> Figure:
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
-    names = [f"{each.ours} / {each.theirs} ({each.world})" for each in found]
-    axes.set_yticks(range(len(found) - 1, -1, -1), names)
-    axes.set_ylim(-0.6, len(found) - 0.4)
+    label_rows(axes, [f"{each.ours} / {each.theirs} ({each.world})" for each in found])
     axes.set_xlabel("ratio of bumps, 95 % interval; grey: counts as equal")
-    axes.grid(axis="y", visible=False)
     return figure

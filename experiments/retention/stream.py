@@ -71,14 +71,7 @@ class Recorder(Watch):
     def turn(self, loop: SingleProcess, done: TurnDone) -> None:
         """Write what a turn brought."""
         episode, commit = done.submitted, done.commit
-        rows, images = sample_rows(
-            episode,
-            loop.memory.worlds,
-            first_id=commit.first_id,
-            commit=commit.commit,
-            number=commit.episode,
-            stored=commit.stored,
-        )
+        rows, images = sample_rows(episode, loop.memory.worlds, commit)
         turn = np.zeros(1, TURNS)
         turn["commit"], turn["episode"] = commit.commit, commit.episode
         turn["next_id"] = commit.first_id + commit.stored

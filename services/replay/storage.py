@@ -111,14 +111,7 @@ class Storage:
 
     def _write_samples(self, txn: Txn, episode: Episode, commit: Commit) -> None:
         worlds = list(self._tables.meta(txn, "worlds"))
-        rows, images = sample_rows(
-            episode,
-            worlds,
-            first_id=commit.first_id,
-            commit=commit.commit,
-            number=commit.episode,
-            stored=commit.stored,
-        )
+        rows, images = sample_rows(episode, worlds, commit)
         self._tables.put_meta(txn, "worlds", worlds)
         keys = [key_of(commit.first_id + i) for i in range(commit.stored)]
         for table, values in (("images", images), ("samples", rows)):

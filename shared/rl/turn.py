@@ -7,7 +7,7 @@ publish. The replay service and the single-process loop both call these.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -33,25 +33,43 @@ class Maintenance:
     equalised: bool
 
 
-def sample_rows(
-    episode: Episode, worlds: list[str], *, first_id: int, commit: int, number: int, stored: int
-) -> tuple[np.ndarray, Images]:
-    """Return the first `stored` samples of an episode as rows and images for a `ReplayMemory`.
+class Numbered(Protocol):
+    """The numbers that replay gave a submission."""
 
-    worlds: names that the rows' column points into; it grows as needed. first_id: insertion number
-    of the first sample; commit: number of the submission; number: the global episode number e, 0
-    while the memory is filled.
+    @property
+    def commit(self) -> int:
+        """Number of the submission."""
+
+    @property
+    def episode(self) -> int:
+        """The global episode number e; 0 while the memory is filled."""
+
+    @property
+    def first_id(self) -> int:
+        """Insertion number of the first sample."""
+
+    @property
+    def stored(self) -> int:
+        """How many samples are stored, from the first."""
+
+
+def sample_rows(
+    episode: Episode, worlds: list[str], numbers: Numbered
+) -> tuple[np.ndarray, Images]:
+    """Return the stored samples of an episode as rows and images for a `ReplayMemory`.
+
+    worlds: names that the rows' column points into; it grows as needed.
     """
     values = EPISODE.decode(episode)
     rows = np.zeros(episode.count, SAMPLE)
-    rows["id"] = np.arange(first_id, first_id + episode.count)
+    rows["id"] = numbers.first_id + np.arange(episode.count)
     rows["action"], rows["reward"] = values["sample_actions"], values["sample_rewards"]
-    rows["commit"], rows["episode"] = commit, number
+    rows["commit"], rows["episode"] = numbers.commit, numbers.episode
     rows["robot_episode"], rows["step"] = values["sample_episodes"], values["sample_steps"]
     rows["version"] = values["sample_versions"]
     rows["world"] = world_indices(worlds, episode.worlds)[values["sample_worlds"]]
     rows["x_m"], rows["y_m"], rows["heading_rad"] = values["positions"].T
-    return rows[:stored], values["images"][:stored]
+    return rows[: numbers.stored], values["images"][: numbers.stored]
 
 
 def maintain(

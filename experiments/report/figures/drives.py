@@ -10,7 +10,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from experiments.report.figures.style import GREY, INK, colours, draw_band, sheet, styled
+from experiments.report.figures.style import (
+    GREY,
+    INK,
+    colours,
+    draw_band,
+    label_rows,
+    sheet,
+    styled,
+)
 from experiments.report.run_folder import Experiment, Floats, Rows
 from experiments.report.statistics import Band, Difference, band_between
 
@@ -145,9 +153,6 @@ def differences(pairs: Sequence[Compared]) -> Figure:
         face = colour if pair.difference.sure else "white"
         axes.plot(pair.difference.mean, at, "o", color=colour, markerfacecolor=face)
     axes.axvline(0.0, color=GREY, linestyle="--", linewidth=1.0)
-    names = [f"{pair.ours} − {pair.theirs} ({pair.world})" for pair in pairs]
-    axes.set_yticks(range(len(pairs) - 1, -1, -1), names)
-    axes.set_ylim(-0.6, len(pairs) - 0.4)
+    label_rows(axes, [f"{pair.ours} − {pair.theirs} ({pair.world})" for pair in pairs])
     axes.set_xlabel("difference in bumps per 1,000 actions, 95 % interval")
-    axes.grid(axis="y", visible=False)
     return figure

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import wraps
 from itertools import pairwise
 from typing import ParamSpec
@@ -119,6 +119,13 @@ def stages_text(stages: tuple[Stage, ...]) -> str:
         for i, stage in enumerate(stages, start=1)
     )
     return f"Stages, with their episodes: {'; '.join(told)}."
+
+
+def label_rows(axes: Axes, names: Sequence[str]) -> None:
+    """Names of rows, the first one on top: row i of n lies at height n - 1 - i."""
+    axes.set_yticks(range(len(names) - 1, -1, -1), names)
+    axes.set_ylim(-0.6, len(names) - 0.4)
+    axes.grid(axis="y", visible=False)
 
 
 def legend_below(axes: Axes, columns: int) -> None:
