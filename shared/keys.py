@@ -22,6 +22,13 @@ KIB = 1024
 MIB = 1024 * 1024
 
 
+Role = Literal["driver", "actor", "replay", "learner", "operator", "watcher"]
+"""Who may be on the bus. An operator is a person with tools that command; a watcher only reads."""
+LOOKING: tuple[Role, ...] = ("operator", "watcher")
+SERVING: tuple[Role, ...] = ("driver", "actor", "replay", "learner")
+ALL: tuple[Role, ...] = (*SERVING, *LOOKING)
+
+
 @dataclass(frozen=True)
 class Stream:
     """One row of the table.
@@ -35,8 +42,10 @@ class Stream:
     delivery: Literal["latest", "request"]
     request: type[m.Message]
     reply: tuple[type[m.Message], ...]
-    sender: str
-    receiver: str
+    senders: tuple[Role, ...]
+    """Who publishes or asks."""
+    receivers: tuple[Role, ...]
+    """Who subscribes or answers."""
     rate: str
     max_bytes: int
     """Larger payloads are refused before they are decoded (of a request or a publication)."""
@@ -80,14 +89,14 @@ def _latest(
     name: str,
     pattern: str,
     message: type[m.Message],
-    sender: str,
-    receiver: str,
+    senders: tuple[Role, ...],
+    receivers: tuple[Role, ...],
     rate: str,
     max_bytes: int,
 ) -> Stream:
     """A row of the first table below."""
     return Stream(
-        name, pattern, "latest", message, (), sender, receiver, rate, max_bytes, 1, NEWEST
+        name, pattern, "latest", message, (), senders, receivers, rate, max_bytes, 1, NEWEST
     )
 
 
@@ -96,40 +105,40 @@ def _request(
     pattern: str,
     request: type[m.Message],
     reply: tuple[type[m.Message], ...],
-    sender: str,
-    receiver: str,
+    senders: tuple[Role, ...],
+    receivers: tuple[Role, ...],
     rate: str,
     max_bytes: int,
     queue: int,
 ) -> Stream:
     """A row of the second table below."""
     return Stream(
-        name, pattern, "request", request, reply, sender, receiver, rate, max_bytes, queue, BUSY
+        name, pattern, "request", request, reply, senders, receivers, rate, max_bytes, queue, BUSY
     )
 
 
 # fmt: off
 # Published: the receiver holds the newest of each key.
 #                       name             key                             message         from            to                         rate                                                 at most
-OBSERVATION   = _latest("observation",   "{run}/robot/{id}/observation", m.Observation,  "robot_driver", "actor, monitor",          "one per action",                                    8 * KIB)
-ACTION        = _latest("action",        "{run}/actor/{id}/action",      m.Action,       "actor",        "robot_driver, monitor",   "one per observation",                               2 * KIB)
-ROBOT_STATE   = _latest("robot_state",   "{run}/robot/{id}/state",       m.RobotState,   "robot_driver", "monitor",                 "1 Hz",                                              4 * KIB)
-ACTOR_STATE   = _latest("actor_state",   "{run}/actor/{id}/state",       m.ActorState,   "actor",        "monitor",                 "1 Hz",                                              4 * KIB)
-REPLAY_STATE  = _latest("replay_state",  "{run}/replay/main/state",      m.ReplayState,  "replay",       "learner, actor, monitor", "1 Hz and at every turn",                            4 * KIB)
-LEARNER_STATE = _latest("learner_state", "{run}/learner/main/state",     m.LearnerState, "learner",      "actor, replay, monitor",  "1 Hz, 4 Hz while training, and at every turn done", 4 * KIB)
+OBSERVATION   = _latest("observation",   "{run}/robot/{id}/observation", m.Observation,  ("driver",),  ("actor", *LOOKING), "one per action",                                    8 * KIB)
+ACTION        = _latest("action",        "{run}/actor/{id}/action",      m.Action,       ("actor",),   ("driver", *LOOKING), "one per observation",                               2 * KIB)
+ROBOT_STATE   = _latest("robot_state",   "{run}/robot/{id}/state",       m.RobotState,   ("driver",),  LOOKING, "1 Hz",                                              4 * KIB)
+ACTOR_STATE   = _latest("actor_state",   "{run}/actor/{id}/state",       m.ActorState,   ("actor",),   LOOKING, "1 Hz",                                              4 * KIB)
+REPLAY_STATE  = _latest("replay_state",  "{run}/replay/main/state",      m.ReplayState,  ("replay",),  ("learner", "actor", *LOOKING), "1 Hz and at every turn",                            4 * KIB)
+LEARNER_STATE = _latest("learner_state", "{run}/learner/main/state",     m.LearnerState, ("learner",), ("actor", "replay", *LOOKING), "1 Hz, 4 Hz while training, and at every turn done", 4 * KIB)
 
 # Asked for and answered.
 #                        name             key                             request             answers                from (asks)              to (answers)     rate                        at most   queue
-ROBOT_COMMAND = _request("robot_command", "{run}/robot/{id}/command",     m.RobotCommand,     (m.RobotState,),       "anyone",                "robot_driver",  "rare",                     1 * KIB,  16)
-ROBOT_WORLD   = _request("robot_world",   "{run}/robot/{id}/world",       m.WorldChange,      (m.WorldChanged,),     "anyone",                "robot_driver",  "rare",                     1 * KIB,  16)
-EPISODE       = _request("episode",       "{run}/replay/main/episode",    m.Episode,          (m.EpisodeAck,),       "actor",                 "replay",        "one per episode",          24 * MIB, 16)
-PROGRESS      = _request("progress",      "{run}/replay/main/progress",   m.ProgressRequest,  (m.RobotProgress,),    "actor",                 "replay",        "at start",                 1 * KIB,  16)
-TURNS         = _request("turns",         "{run}/replay/main/turns",      m.TurnsRequest,     (m.Turns,),            "learner",               "replay",        "one per turn",             1 * KIB,  16)
-CHANGES       = _request("changes",       "{run}/replay/main/changes",    m.ChangesRequest,   (m.Change, m.FeedEnd), "learner",               "replay",        "one per turn",             1 * KIB,  4)
-SNAPSHOT      = _request("snapshot",      "{run}/replay/main/snapshot",   m.SnapshotRequest,  (m.Change, m.FeedEnd), "learner",               "replay",        "at start and after a gap", 1 * KIB,  4)
-MINI_BATCH    = _request("mini_batch",    "{run}/replay/main/mini_batch", m.MiniBatchRequest, (m.Change,),           "a foreign learner",     "replay",        "any",                      1 * KIB,  4)
-WEIGHTS       = _request("weights",       "{run}/learner/main/weights",   m.WeightsRequest,   (m.Weights,),          "actor, replay, anyone", "learner",       "one per version",          1 * KIB,  16)
-SERVICE       = _request("service",       "{run}/service/{id}/command",   m.ServiceCommand,   (m.ServiceReply,),     "anyone",                "every service", "rare",                     1 * KIB,  16)
+ROBOT_COMMAND = _request("robot_command", "{run}/robot/{id}/command",     m.RobotCommand,     (m.RobotState,),       ("operator",), ("driver",), "rare",                     1 * KIB,  16)
+ROBOT_WORLD   = _request("robot_world",   "{run}/robot/{id}/world",       m.WorldChange,      (m.WorldChanged,),     ("operator",), ("driver",), "rare",                     1 * KIB,  16)
+EPISODE       = _request("episode",       "{run}/replay/main/episode",    m.Episode,          (m.EpisodeAck,),       ("actor",), ("replay",), "one per episode",          24 * MIB, 16)
+PROGRESS      = _request("progress",      "{run}/replay/main/progress",   m.ProgressRequest,  (m.RobotProgress,),    ("actor",), ("replay",), "at start",                 1 * KIB,  16)
+TURNS         = _request("turns",         "{run}/replay/main/turns",      m.TurnsRequest,     (m.Turns,),            ("learner",), ("replay",), "one per turn",             1 * KIB,  16)
+CHANGES       = _request("changes",       "{run}/replay/main/changes",    m.ChangesRequest,   (m.Change, m.FeedEnd), ("learner",), ("replay",), "one per turn",             1 * KIB,  4)
+SNAPSHOT      = _request("snapshot",      "{run}/replay/main/snapshot",   m.SnapshotRequest,  (m.Change, m.FeedEnd), ("learner",), ("replay",), "at start and after a gap", 1 * KIB,  4)
+MINI_BATCH    = _request("mini_batch",    "{run}/replay/main/mini_batch", m.MiniBatchRequest, (m.Change,),           ("learner",), ("replay",), "any",                      1 * KIB,  4)
+WEIGHTS       = _request("weights",       "{run}/learner/main/weights",   m.WeightsRequest,   (m.Weights,),          ("actor", "replay", *LOOKING), ("learner",), "one per version",          1 * KIB,  16)
+SERVICE       = _request("service",       "{run}/service/{id}/command",   m.ServiceCommand,   (m.ServiceReply,),     ("operator",), SERVING, "rare",                     1 * KIB,  16)
 
 STREAMS: tuple[Stream, ...] = (
     OBSERVATION, ACTION, ROBOT_STATE, ROBOT_COMMAND, ROBOT_WORLD, ACTOR_STATE,

@@ -36,8 +36,9 @@ def streams_table() -> str:
         answers = " / ".join(reply.__name__ for reply in s.reply)
         payload = s.request.__name__ + (f" -> {answers}" if answers else "")
         lines.append(
-            f"| {s.name} | `{s.pattern}` | {payload} | {s.sender} -> {s.receiver} | {s.delivery} "
-            f"| {s.rate} | {_size(s.max_bytes)} | {s.queue} | {s.overflow} |"
+            f"| {s.name} | `{s.pattern}` | {payload} "
+            f"| {', '.join(s.senders)} -> {', '.join(s.receivers)} "
+            f"| {s.delivery} | {s.rate} | {_size(s.max_bytes)} | {s.queue} | {s.overflow} |"
         )
     return "\n".join(lines)
 
