@@ -86,7 +86,7 @@ class Ours:
                 self._store(submission)
             action = self._actor.act(self._observation)
             assert action.action is not None
-            self._driver.execute(action.action)
+            self._driver.execute(action.action, action.actor_life)
             self._observation = self._driver.observe()
             self._steps += 1
             if self._steps > self._random_steps and self._steps % EVERY == 0:

@@ -19,12 +19,13 @@ from typing import Any, Self
 import httpx
 
 from benchmarks.waiting import wait_until
+from services.monitor.halting import RobotOrder, order
 from shared import settings
 from shared.bus import Bus
 from shared.config import Config
-from shared.errors import BusError, RouterMissing
-from shared.keys import ROBOT_COMMAND, ROBOT_STATE
-from shared.messages import RobotCommand, RobotState
+from shared.errors import PeerMissing, RouterMissing
+from shared.keys import ROBOT_STATE
+from shared.messages import RobotState
 from shared.provenance import ROOT
 
 LEFT = "1"
@@ -216,20 +217,19 @@ class Rig:
         assert isinstance(found, RobotState)
         return found
 
-    def command(self, name: str) -> RobotState:
-        """An operator's command, repeated until it is acknowledged."""
-        message = RobotCommand.model_validate({"command": name})
+    def command(self, name: RobotOrder) -> RobotState:
+        """An operator's order, repeated until it is obeyed; the next heartbeat."""
 
-        def asked() -> RobotState | None:
+        def obeyed() -> bool:
             try:
-                ident = self.config.robot.id
-                return self.bus.request(ROBOT_COMMAND, message, RobotState, ident=ident)
-            except BusError:
-                return None
+                return order(self.bus, name, self.config.robot.id, lambda _: None)
+            except PeerMissing:
+                return False
 
-        state = wait_until(asked, PATIENCE_S, f"{name} acknowledged")
-        assert state is not None
-        return state
+        assert self.bus
+        self._inbox.take(ROBOT_STATE, RobotState)
+        wait_until(obeyed, PATIENCE_S, f"{name} obeyed")
+        return self.wait_state(lambda _: True, "a heartbeat")
 
     def wait(self, condition: Callable[[], Any], what: str) -> Any:
         """Wait with a deadline, and show what was known when it passes."""

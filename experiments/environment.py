@@ -113,7 +113,7 @@ class CorridorEnv(gymnasium.Env[Image, np.int64]):
         before = self._seen
         if before is None or self._bumped:
             raise ResetNeeded("call reset() at first and after a bump")
-        self.driver.start(int(action))
+        self.driver.start(int(action), LIFE)
         self._bumped = self.driver.advance(self.config.robot.period_s)
         if self._bumped:
             return _pixels(before), -1.0, True, False, {}

@@ -15,6 +15,7 @@ from shared.codec import decode, encode
 from shared.config import BusConfig
 from shared.errors import (
     BadMessage,
+    BusError,
     ConfigError,
     PeerMissing,
     PeerRefused,
@@ -22,8 +23,8 @@ from shared.errors import (
     RouterMissing,
 )
 from shared.inbox import Inbox
-from shared.keys import Peer, Stream, alive_key, ident_in, parse_alive
-from shared.messages import Message
+from shared.keys import CLAIM_PATTERN, Peer, Stream, alive_key, check_sender, ident_in, parse_alive
+from shared.messages import Message, Refusal
 
 M = TypeVar("M", bound=Message)
 REPLY_LIMIT = 16 * 1024 * 1024
@@ -67,8 +68,8 @@ class Request:
     message: Message
     """The question, as soon as `read` has returned."""
 
-    def __init__(self, stream: Stream, query: zenoh.Query) -> None:
-        self.stream, self._query = stream, query
+    def __init__(self, stream: Stream, query: zenoh.Query, ident: str) -> None:
+        self.stream, self._query, self.ident = stream, query, ident
 
     def __enter__(self) -> Self:
         return self
@@ -82,17 +83,18 @@ class Request:
         return len(self._query.payload or b"")
 
     def read(self) -> None:
-        """Decode the message. Raises BadMessage."""
+        """Decode the message. Raises BadMessage, also if it is of another robot than its key."""
         payload = self._query.payload
         self.message = decode(payload.to_bytes() if payload else b"", self.stream.request)
+        check_sender(self.stream, self.ident, self.message)
 
     def reply(self, message: Message) -> None:
         """Send one answer; several are allowed where the stream says so."""
         self._query.reply(self._query.key_expr, encode(message))
 
-    def refuse(self, reason: str) -> None:
-        """Answer with an error in one line."""
-        self._query.reply_err(reason.encode())
+    def refuse(self, reason: str, *, final: bool = False) -> None:
+        """Answer with an error in one line; final: the same request will be refused again."""
+        self._query.reply_err(encode(Refusal(final=final, reason=reason[:300])))
 
 
 class Bus:
@@ -155,11 +157,21 @@ class Bus:
         self._declared.append(self._session.declare_subscriber(key, direct))
 
     def serve(self, stream: Stream, ident: str, receive: Callable[[Request], None]) -> None:
-        """Receive the requests of a `request` stream. `receive` must only enqueue."""
-        key = stream.key(self.run, ident)
+        """Receive the requests of a `request` stream, of one id or of all (`*`).
+
+        `receive` must only enqueue. A request must name the concrete key: an answer to a wildcard
+        could not be told from those of others.
+        """
+        key = stream.wildcard(self.run) if ident == "*" else stream.key(self.run, ident)
 
         def on_query(query: zenoh.Query) -> None:
-            receive(Request(stream, query))
+            named = ident_in(stream, str(query.key_expr))
+            request = Request(stream, query, named or "")
+            if named is not None:
+                receive(request)
+                return
+            with request:
+                request.refuse(f"expected a request for a concrete key like {key}", final=True)
 
         self._declared.append(self._session.declare_queryable(key, on_query, complete=True))
 
@@ -213,12 +225,7 @@ class Bus:
         for reply in replies:
             answered = True
             if reply.ok is None:
-                text = reply.err.payload.to_string() if reply.err else "unknown error"
-                raise (
-                    PeerSilent(f"{key}: no answer in time")
-                    if text == "Timeout"
-                    else PeerRefused(f"{key}: {text}")
-                )
+                raise _failure(key, reply)
             payload = reply.ok.payload
             if len(payload) > REPLY_LIMIT:
                 raise BadMessage(f"{key}: reply of {len(payload)} bytes, at most {REPLY_LIMIT}")
@@ -226,16 +233,89 @@ class Bus:
         if not answered:
             raise PeerMissing(f"{key}: nobody answers")
 
+    def ask_all(
+        self,
+        stream: Stream,
+        message: Message,
+        receive: Callable[[bytes], None],
+        *,
+        ident: str = "main",
+        timeout_s: float,
+    ) -> None:
+        """Ask every other life that serves a stream, without waiting.
+
+        `receive` takes the bytes of each answer, on a thread of Zenoh: it must only enqueue.
+        Whoever refuses has not answered.
+        """
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            if reply.ok is not None and len(reply.ok.payload) <= REPLY_LIMIT:
+                receive(reply.ok.payload.to_bytes())
+
+        self._session.get(
+            stream.key(self.run, ident),
+            on_reply,
+            payload=encode(message),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.REAL_TIME,
+            express=True,
+            allowed_destination=zenoh.Locality.REMOTE,
+            timeout=timeout_s,
+        )
+
     def announce(self, service: str, ident: str, life: str, protocol: int, config: str) -> None:
         """Declare the liveliness token that tells others who is there."""
         key = alive_key(self.run, service, ident, life, protocol, config)
         self._declared.append(self._session.liveliness().declare_token(key))
 
-    def peers(self, timeout_s: float = 2.0) -> list[Peer]:
+    def peers(self, service: str = "*", ident: str = "*", timeout_s: float = 2.0) -> list[Peer]:
         """Everybody alive in this run now (empty without a router)."""
-        replies = self._session.liveliness().get(f"{self.run}/alive/**", timeout=timeout_s)
-        peers = (parse_alive(str(reply.ok.key_expr)) for reply in replies if reply.ok)
+        key = f"{self.run}/alive/{service}/{ident}/**"
+        replies = self._session.liveliness().get(key, timeout=timeout_s)
+        peers = {parse_alive(str(reply.ok.key_expr)) for reply in replies if reply.ok}
         return sorted((peer for peer in peers if peer), key=lambda peer: (peer.service, peer.id))
+
+    def watch(self, service: str, ident: str, receive: Callable[[Peer, bool], None]) -> None:
+        """Hear of peers that are there, come and go. `receive` must only enqueue."""
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            if (peer := parse_alive(str(sample.key_expr))) is not None:
+                receive(peer, sample.kind == zenoh.SampleKind.PUT)
+
+        key = f"{self.run}/alive/{service}/{ident}/**"
+        liveliness = self._session.liveliness()
+        self._declared.append(liveliness.declare_subscriber(key, on_sample, history=True))
+
+    @contextmanager
+    def claiming(self, service: str, ident: str, life: str) -> Iterator[None]:
+        """Have the token of a process that wants a role while the block runs."""
+        token = self._session.liveliness().declare_token(
+            CLAIM_PATTERN.format(run=self.run, service=service, id=ident, life=life)
+        )
+        try:
+            yield
+        finally:
+            token.undeclare()  # type: ignore[no-untyped-call]
+
+    def claims(self, service: str, ident: str, timeout_s: float = 2.0) -> set[str]:
+        """Lives of the processes that want a role now."""
+        key = CLAIM_PATTERN.format(run=self.run, service=service, id=ident, life="*")
+        replies = self._session.liveliness().get(key, timeout=timeout_s)
+        return {str(reply.ok.key_expr).split("/")[-1] for reply in replies if reply.ok}
+
+
+def _failure(key: str, reply: zenoh.Reply) -> BusError:
+    """What an error reply means."""
+    payload = reply.err.payload.to_bytes() if reply.err else b""
+    if payload == b"Timeout":
+        return PeerSilent(f"{key}: no answer in time")
+    try:
+        refusal = decode(payload, Refusal)
+    except BadMessage:
+        return PeerRefused(f"{key}: {payload[:300]!r}")
+    return PeerRefused(f"{key}: {refusal.reason}", final=refusal.final)
 
 
 @contextmanager

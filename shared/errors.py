@@ -3,13 +3,14 @@
 CorridorError
 ├── ConfigError        wrong configuration or folder: exit code 2, one line, nothing moved yet
 ├── StateError         what lies on disk does not fit or is damaged: exit code 3
+├── RoleTaken          another process has this role: exit code 4, one line
 ├── RobotMissing       no real robot answers (yet): exit code 1, one line
 ├── BadMessage         bytes that are not a valid message of the expected type
 └── BusError
     ├── RouterMissing  no router at the endpoint (yet)
     ├── PeerMissing    nobody serves this request now
     ├── PeerSilent     served, but no complete answer in time
-    ├── PeerRefused    answered with an error; the text is the peer's
+    ├── PeerRefused    answered with an error, final or not; the text is the peer's
     └── RobotTaken     somebody else commands this robot
 """
 
@@ -24,6 +25,10 @@ class ConfigError(CorridorError):
 
 class StateError(CorridorError):
     """State on disk that does not belong to this run or is damaged."""
+
+
+class RoleTaken(CorridorError):
+    """Another process has the role that this one wants; the text names it."""
 
 
 class RobotMissing(CorridorError):
@@ -51,7 +56,11 @@ class PeerSilent(BusError):
 
 
 class PeerRefused(BusError):
-    """The peer answered with an error."""
+    """The peer answered with an error. `final`: the same request will be refused again."""
+
+    def __init__(self, text: str, *, final: bool = False) -> None:
+        super().__init__(text)
+        self.final = final
 
 
 class RobotTaken(BusError):

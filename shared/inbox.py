@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from shared.codec import decode
 from shared.errors import BadMessage
-from shared.keys import Stream
+from shared.keys import Peer, Stream, check_sender
 from shared.messages import Message
 
 if TYPE_CHECKING:
@@ -23,7 +23,11 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 M = TypeVar("M", bound=Message)
 MAX_SENDERS = 64
-"""Senders of one `latest` stream an inbox keeps apart; more are refused and counted."""
+"""Senders of one `latest` stream an inbox keeps apart; what comes of more is counted as busy."""
+
+
+MAX_ANSWERS = 256
+"""Answers to questions to all that are kept; newer ones replace the oldest."""
 
 
 class Inbox:
@@ -37,7 +41,11 @@ class Inbox:
         self._latest: dict[tuple[str, str], bytes] = {}
         self._queues: dict[str, deque[Request]] = {}
         self.refused: Counter[str] = Counter()
-        """Messages not taken, by stream: undecodable, oversized, badly addressed or overflowing."""
+        """Messages not taken, by stream: undecodable, oversized or badly addressed."""
+        self.busy: Counter[str] = Counter()
+        """Messages not taken because there was no room."""
+        self._answers: deque[bytes] = deque(maxlen=MAX_ANSWERS)
+        self._present: dict[tuple[str, str], set[str]] = {}
 
     def subscribe(self, stream: Stream, ident: str = "*") -> None:
         """Keep the newest message of every matching sender of a `latest` stream."""
@@ -45,9 +53,10 @@ class Inbox:
         def keep(sender: str | None, data: bytes) -> None:
             with self._ready:
                 slot = (stream.name, sender or "")
-                full = slot not in self._latest and len(self._latest) >= MAX_SENDERS
-                if sender is None or full:
+                if sender is None:
                     self.refused[stream.name] += 1
+                elif slot not in self._latest and len(self._latest) >= MAX_SENDERS:
+                    self.busy[stream.name] += 1
                 else:
                     self._latest[slot] = data
                     self._arrive()
@@ -55,24 +64,68 @@ class Inbox:
         self._bus.subscribe(stream, ident, keep)
 
     def serve(self, stream: Stream, ident: str = "main") -> None:
-        """Queue the requests of a `request` stream; when full, answer "busy" at once."""
+        """Queue the requests of a `request` stream; when full, answer "busy" at once.
+
+        Of several streams, the requests of the one that was served first come first.
+        """
         queue = self._queues.setdefault(stream.name, deque())
 
         def enqueue(request: Request) -> None:
             with self._ready:
-                if not 0 < request.size <= stream.max_bytes:
-                    problem = f"expected 1..{stream.max_bytes} bytes of payload"
-                elif len(queue) >= stream.queue:
-                    problem = "busy"
-                else:
+                fits = 0 < request.size <= stream.max_bytes
+                if fits and len(queue) < stream.queue:
                     queue.append(request)
                     self._arrive()
                     return
-                self.refused[stream.name] += 1
+                (self.busy if fits else self.refused)[stream.name] += 1
             with request:
-                request.refuse(problem)
+                expected = f"expected 1..{stream.max_bytes} bytes of payload"
+                request.refuse("busy" if fits else expected, final=not fits)
 
         self._bus.serve(stream, ident, enqueue)
+
+    def ask_all(
+        self, stream: Stream, message: Message, *, ident: str = "main", timeout_s: float
+    ) -> None:
+        """Ask every other life that serves a stream; `answers` has what comes within the time."""
+
+        def keep(data: bytes) -> None:
+            with self._ready:
+                self._answers.append(data)
+                self._arrive()
+
+        self._bus.ask_all(stream, message, keep, ident=ident, timeout_s=timeout_s)
+
+    def answers(self, cls: type[M]) -> list[M]:
+        """The answers that have come; what is no such message is left out, and logged."""
+        with self._ready:
+            raw = list(self._answers)
+            self._answers.clear()
+        answers = []
+        for data in raw:
+            try:
+                answers.append(decode(data, cls))
+            except BadMessage as error:
+                log.warning("answer refused: %s", error)
+        return answers
+
+    def watch(self, service: str, ident: str = "*") -> None:
+        """Keep whose lives are there; see `lives`."""
+
+        def note(peer: Peer, here: bool) -> None:
+            with self._ready:
+                lives = self._present.setdefault((peer.service, peer.id), set())
+                lives.add(peer.life) if here else lives.discard(peer.life)
+                if not lives:
+                    del self._present[peer.service, peer.id]
+                self._arrive()
+
+        self._bus.watch(service, ident, note)
+
+    def lives(self, service: str, ident: str) -> frozenset[str]:
+        """The lives that have a role now, as far as their tokens tell."""
+        with self._ready:
+            return frozenset(self._present.get((service, ident), ()))
 
     def wait(self, timeout_s: float) -> bool:
         """Wait until something arrives that was not waited for before; False at the timeout."""
@@ -95,8 +148,7 @@ class Inbox:
         for sender, data in raw:
             try:
                 message = decode(data, cls)
-                if getattr(message, "robot", sender) != sender and "{id}" in stream.pattern:
-                    raise BadMessage(f"{cls.__name__} of {message!r:.60} under the key of {sender}")
+                check_sender(stream, sender, message)
             except BadMessage as error:
                 self._refuse(stream, error)
                 continue
@@ -116,14 +168,19 @@ class Inbox:
             except BadMessage as error:
                 self._refuse(request.stream, error)
                 with request:
-                    request.refuse(f"bad message: {error}")
+                    request.refuse(f"bad message: {error}", final=True)
                 continue
             yield request
 
     @property
     def refused_total(self) -> int:
-        """All messages not taken so far."""
+        """All messages so far that were not taken because of what they are."""
         return sum(self.refused.values())
+
+    @property
+    def busy_total(self) -> int:
+        """All messages so far that were not taken because there was no room."""
+        return sum(self.busy.values())
 
     def _refuse(self, stream: Stream, error: BadMessage) -> None:
         with self._ready:

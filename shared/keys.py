@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from shared import messages as m
+from shared.errors import BadMessage
 from shared.facts import NAME
 
 KIB = 1024
@@ -81,6 +82,15 @@ def ident_in(stream: Stream, key: str) -> str | None:
     return ident
 
 
+def check_sender(stream: Stream, ident: str, message: m.Message) -> None:
+    """Raise BadMessage if a message tells of another robot than the one whose key it came by."""
+    if getattr(message, "robot", ident) != ident and "{id}" in stream.pattern:
+        kind = type(message).__name__
+        raise BadMessage(
+            f"{kind} of {getattr(message, 'robot', '')!r:.60} under the key of {ident}"
+        )
+
+
 NEWEST = "newer replaces unread older"
 BUSY = "error reply 'busy', the sender repeats it"
 
@@ -119,36 +129,40 @@ def _request(
 
 # fmt: off
 # Published: the receiver holds the newest of each key.
-#                       name             key                             message         from            to                         rate                                                 at most
-OBSERVATION   = _latest("observation",   "{run}/robot/{id}/observation", m.Observation,  ("driver",),  ("actor", *LOOKING), "one per action",                                    8 * KIB)
-ACTION        = _latest("action",        "{run}/actor/{id}/action",      m.Action,       ("actor",),   ("driver", *LOOKING), "one per observation",                               2 * KIB)
-ROBOT_STATE   = _latest("robot_state",   "{run}/robot/{id}/state",       m.RobotState,   ("driver",),  LOOKING, "1 Hz",                                              4 * KIB)
-ACTOR_STATE   = _latest("actor_state",   "{run}/actor/{id}/state",       m.ActorState,   ("actor",),   LOOKING, "1 Hz",                                              4 * KIB)
+#                       name             key                             message         from          to                              rate                                                 at most
+OBSERVATION   = _latest("observation",   "{run}/robot/{id}/observation", m.Observation,  ("driver",),  ("actor", *LOOKING),            "one per action",                                    8 * KIB)
+ACTION        = _latest("action",        "{run}/actor/{id}/action",      m.Action,       ("actor",),   ("driver", *LOOKING),           "one per observation",                               2 * KIB)
+ROBOT_STATE   = _latest("robot_state",   "{run}/robot/{id}/state",       m.RobotState,   ("driver",),  LOOKING,                        "1 Hz",                                              4 * KIB)
+ACTOR_STATE   = _latest("actor_state",   "{run}/actor/{id}/state",       m.ActorState,   ("actor",),   LOOKING,                        "1 Hz",                                              4 * KIB)
 REPLAY_STATE  = _latest("replay_state",  "{run}/replay/main/state",      m.ReplayState,  ("replay",),  ("learner", "actor", *LOOKING), "1 Hz and at every turn",                            4 * KIB)
-LEARNER_STATE = _latest("learner_state", "{run}/learner/main/state",     m.LearnerState, ("learner",), ("actor", "replay", *LOOKING), "1 Hz, 4 Hz while training, and at every turn done", 4 * KIB)
+LEARNER_STATE = _latest("learner_state", "{run}/learner/main/state",     m.LearnerState, ("learner",), ("actor", "replay", *LOOKING),  "1 Hz, 4 Hz while training, and at every turn done", 4 * KIB)
 
 # Asked for and answered.
-#                        name             key                             request             answers                from (asks)              to (answers)     rate                        at most   queue
-ROBOT_COMMAND = _request("robot_command", "{run}/robot/{id}/command",     m.RobotCommand,     (m.RobotState,),       ("operator",), ("driver",), "rare",                     1 * KIB,  16)
-ROBOT_WORLD   = _request("robot_world",   "{run}/robot/{id}/world",       m.WorldChange,      (m.WorldChanged,),     ("operator",), ("driver",), "rare",                     1 * KIB,  16)
-EPISODE       = _request("episode",       "{run}/replay/main/episode",    m.Episode,          (m.EpisodeAck,),       ("actor",), ("replay",), "one per episode",          24 * MIB, 16)
-PROGRESS      = _request("progress",      "{run}/replay/main/progress",   m.ProgressRequest,  (m.RobotProgress,),    ("actor",), ("replay",), "at start",                 1 * KIB,  16)
-TURNS         = _request("turns",         "{run}/replay/main/turns",      m.TurnsRequest,     (m.Turns,),            ("learner",), ("replay",), "one per turn",             1 * KIB,  16)
-CHANGES       = _request("changes",       "{run}/replay/main/changes",    m.ChangesRequest,   (m.Change, m.FeedEnd), ("learner",), ("replay",), "one per turn",             1 * KIB,  4)
-SNAPSHOT      = _request("snapshot",      "{run}/replay/main/snapshot",   m.SnapshotRequest,  (m.Change, m.FeedEnd), ("learner",), ("replay",), "at start and after a gap", 1 * KIB,  4)
-MINI_BATCH    = _request("mini_batch",    "{run}/replay/main/mini_batch", m.MiniBatchRequest, (m.Change,),           ("learner",), ("replay",), "any",                      1 * KIB,  4)
-WEIGHTS       = _request("weights",       "{run}/learner/main/weights",   m.WeightsRequest,   (m.Weights,),          ("actor", "replay", *LOOKING), ("learner",), "one per version",          1 * KIB,  16)
-SERVICE       = _request("service",       "{run}/service/{id}/command",   m.ServiceCommand,   (m.ServiceReply,),     ("operator",), SERVING, "rare",                     1 * KIB,  16)
+#                       name            key                               request             answers                from (asks)                    to (answers)  rate                              at most   queue
+HALT         = _request("halt",         "{run}/halt",                     m.Halts,            (m.Standing,),         (*SERVING, "operator"),        SERVING,      "until all stand, then 1 Hz",     8 * KIB,  64)
+RELEASE      = _request("release",      "{run}/release",                  m.Release,          (m.Standing,),         ("operator",),                 SERVING,      "rare",                           16 * KIB, 16)
+ROBOT_WORLD  = _request("robot_world",  "{run}/robot/{id}/world",         m.WorldChange,      (m.WorldChanged,),     ("operator",),                 ("driver",),  "rare",                           1 * KIB,  16)
+EPISODE      = _request("episode",      "{run}/replay/main/episode/{id}", m.Episode,          (m.EpisodeAck,),       ("actor",),                    ("replay",),  "one per episode",                24 * MIB, 16)
+PROGRESS     = _request("progress",     "{run}/replay/main/progress/{id}", m.ProgressRequest, (m.RobotProgress,),    ("actor",),                    ("replay",),  "at start",                       1 * KIB,  16)
+TURNS        = _request("turns",        "{run}/replay/main/turns",        m.TurnsRequest,     (m.Turns,),            ("learner",),                  ("replay",),  "one per turn",                   1 * KIB,  16)
+CHANGES      = _request("changes",      "{run}/replay/main/changes",      m.ChangesRequest,   (m.Change, m.FeedEnd), ("learner",),                  ("replay",),  "one per turn",                   1 * KIB,  4)
+SNAPSHOT     = _request("snapshot",     "{run}/replay/main/snapshot",     m.SnapshotRequest,  (m.Change, m.FeedEnd), ("learner",),                  ("replay",),  "at start and after a gap",       1 * KIB,  4)
+MINI_BATCH   = _request("mini_batch",   "{run}/replay/main/mini_batch",   m.MiniBatchRequest, (m.Change,),           ("learner",),                  ("replay",),  "any",                            1 * KIB,  4)
+WEIGHTS      = _request("weights",      "{run}/learner/main/weights",     m.WeightsRequest,   (m.Weights,),          ("actor", "replay", *LOOKING), ("learner",), "one per version",                1 * KIB,  16)
+PING         = _request("ping",         "{run}/service/{id}/ping",        m.Ping,             (m.ServiceReply,),     ALL,                           SERVING,      "rare",                           1 * KIB,  16)
+STOP         = _request("stop",         "{run}/service/{id}/stop",        m.StopService,      (m.ServiceReply,),     ("operator",),                 SERVING,      "rare",                           1 * KIB,  16)
 
 STREAMS: tuple[Stream, ...] = (
-    OBSERVATION, ACTION, ROBOT_STATE, ROBOT_COMMAND, ROBOT_WORLD, ACTOR_STATE,
+    OBSERVATION, ACTION, HALT, RELEASE, ROBOT_STATE, ROBOT_WORLD, ACTOR_STATE,
     EPISODE, PROGRESS, REPLAY_STATE, TURNS, CHANGES, SNAPSHOT, MINI_BATCH,
-    LEARNER_STATE, WEIGHTS, SERVICE,
+    LEARNER_STATE, WEIGHTS, PING, STOP,
 )
 # fmt: on
 
 ALIVE_PATTERN = "{run}/alive/{service}/{id}/{life}/{protocol}/{config}"
 """Liveliness token of every service: who is there, which protocol and configuration it speaks."""
+CLAIM_PATTERN = "{run}/claim/{service}/{id}/{life}"
+"""Liveliness token of a process that wants a role (`shared.roles`)."""
 
 
 def alive_key(run: str, service: str, ident: str, life: str, protocol: int, config: str) -> str:

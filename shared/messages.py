@@ -17,17 +17,24 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from shared.columns import CHANGES, EPISODE
 from shared.facts import ACTION_COUNT, ACTIONS, IMAGE_BYTES, IMAGE_SHAPE, NAME
 
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 2
 MAX_EPISODE_SAMPLES = 5000
 """More samples than this in one episode are refused, whatever the configuration says."""
 
 ImageArray = npt.NDArray[np.uint8]
 Life = Annotated[str, Field(pattern=r"^[0-9a-f]{12}$")]
-"""12 hex digits, drawn at process start; a clean stop saves it and the next start carries on."""
+"""12 hex digits, drawn at process start: no two processes have the same."""
+MAX_EARLIER = 8
+Lives = Annotated[tuple[Life, ...], Field(max_length=MAX_EARLIER)]
 Ident = Annotated[str, Field(pattern=NAME.pattern)]
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 Few = Annotated[int, Field(ge=0, lt=2**31)]
 """Counted per submission and summed up for ever: bounded so that no sender can overflow a sum."""
+Sequence = Annotated[int, Field(ge=0, lt=2**32)]
+Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
+Radians = Annotated[float, Field(ge=-1e6, le=1e6)]
+Seconds = Annotated[float, Field(ge=0.0, le=1e10)]
+ActionNumber = Annotated[int, Field(ge=0, lt=ACTION_COUNT)]
 ActionValues = Annotated[tuple[float, ...], Field(min_length=ACTION_COUNT, max_length=ACTION_COUNT)]
 """One prediction for each action, in the order of `facts.ACTIONS`."""
 Image = Annotated[bytes, Field(min_length=IMAGE_BYTES, max_length=IMAGE_BYTES)]
@@ -74,24 +81,30 @@ class Observation(Message):
 
     robot: Ident
     life: Life
-    sequence: Count
+    earlier: Lives = ()
+    """Lives that this one continues after clean stops, newest first. `sequence` goes on."""
+    sequence: Sequence
     """Grows by one per executed action. The action that answers it has the same number."""
     attempt: Count = 0
     """Counts fresh observations of one sequence: after a hold, a late action or an interruption."""
+    action: ActionNumber | None = None
+    """The action that was executed last, between `sequence - 1` and this; None: there was none."""
+    actor_life: Life | Literal[""] = ""
+    """Life of the actor that had sent it (`Action.actor_life`)."""
     image: Image
-    x_m: float
-    y_m: float
-    heading_rad: float
+    x_m: Metres
+    y_m: Metres
+    heading_rad: Radians
     bump: bool
     """Contact at any time during the last action (E11). A recovery, if any, is over."""
     interruption: Interruption = ""
     world: Ident
-    period_s: Annotated[float, Field(gt=0.0)]
-    stamp_s: float
+    period_s: Annotated[float, Field(gt=0.0, le=60.0)]
+    stamp_s: Seconds
     """Simulated time in lockstep, the driver's monotonic clock in realtime."""
-    laps_left: Count = 0
+    laps_left: Few = 0
     """Laps completed anticlockwise since the life began; 0 in worlds without laps."""
-    laps_right: Count = 0
+    laps_right: Few = 0
     """Laps completed clockwise."""
 
 
@@ -101,11 +114,11 @@ class Action(Message):
     robot: Ident
     actor_life: Life
     robot_life: Life
-    sequence: Count
+    sequence: Sequence
     """Number of the observation answered. The driver ignores an answer to any other."""
     attempt: Count = 0
     """Attempt of the observation answered."""
-    action: Annotated[int, Field(ge=0, lt=ACTION_COUNT)] | None = Field(
+    action: ActionNumber | None = Field(
         description=", ".join(f"{number} {action.name}" for number, action in enumerate(ACTIONS))
         + " (A21); None: hold still for one period."
     )
@@ -134,10 +147,78 @@ class Action(Message):
         return self
 
 
-class RobotCommand(Message):
-    """An operator's command, acknowledged by `RobotState`. Anyone to driver."""
+MAX_HALTS, MAX_RELEASED = 64, 256
+"""Halts in force, and released ones that are remembered: the newest."""
+HaltKind = Literal["estop", "pause"]
+DriverState = Literal["waiting", "driving", "recovering", "blocked", "paused", "estop", "stopped"]
 
-    command: Literal["estop", "clear", "pause", "resume"]
+
+class Halt(Message):
+    """Robots are to stand until this is released."""
+
+    number: Count
+    """No two are alike: the sender's clock in nanoseconds since 1970."""
+    kind: HaltKind
+    """estop: an emergency stop, ended by `clear`. pause: ended by `resume`."""
+    robot: Ident | Literal[""] = ""
+    """Which robot; empty: every robot of the run."""
+
+
+class Released(Message):
+    """A halt that was released, for one robot or for all."""
+
+    number: Count
+    robot: Ident | Literal[""] = ""
+
+
+class Halts(Message):
+    """Halts to take over, as far as they are not known; without any, it only asks.
+
+    An operator, or a service that knows of halts in force, to every driver and service. Every life
+    answers with `Standing`: ask with the target ALL and no consolidation.
+    """
+
+    halts: Annotated[tuple[Halt, ...], Field(max_length=MAX_HALTS)] = ()
+
+
+class Deadline(Message):
+    """Which life is meant, and until when by its own clock (`Standing.clock_s`)."""
+
+    life: Life
+    until_s: Seconds
+
+
+class Release(Message):
+    """Ends halts. Operator to every driver and service; every life answers with `Standing`.
+
+    It names what it ends and whom it means, so that one that comes late, or to another process,
+    does nothing.
+    """
+
+    numbers: Annotated[tuple[Count, ...], Field(min_length=1, max_length=MAX_HALTS)]
+    robot: Ident | Literal[""] = ""
+    """For which robot; empty: for every robot of the run."""
+    deadlines: Annotated[tuple[Deadline, ...], Field(max_length=256)]
+    """At most two seconds after the `Standing` that each life gave last."""
+
+
+class Standing(Message):
+    """What one life knows of halts, and whether its robot stands. Everyone to operator."""
+
+    service: Ident
+    id: Ident
+    life: Life
+    clock_s: Seconds
+    """Its clock, for a release that it is to carry out. It goes on while the machine sleeps."""
+    state: DriverState | Literal[""] = ""
+    """Of a driver's robot; empty: a service without a robot."""
+    stands: bool = False
+    """The robot has been told to stand still, and no action moves it while a halt holds it."""
+    halts: Annotated[tuple[Halt, ...], Field(max_length=MAX_HALTS)]
+    """Those in force as far as it knows; of a driver those that hold its robot."""
+    released: Annotated[tuple[Released, ...], Field(max_length=MAX_RELEASED)] = ()
+    problem: Annotated[str, Field(max_length=300)] = ""
+    """Why the halts could not be kept on disk; a restart would forget them."""
 
 
 class Fault(Message):
@@ -149,16 +230,16 @@ class Fault(Message):
 
 
 class RobotState(Message):
-    """Heartbeat of a driver and its answer to commands. Driver to anyone."""
+    """Heartbeat of a driver. Driver to operator and watcher."""
 
     robot: Ident
     life: Life
-    state: Literal["waiting", "driving", "recovering", "blocked", "paused", "estop", "stopped"]
+    state: DriverState
     """blocked: a real robot is not fit to drive. It goes on by itself once it is."""
-    sequence: Count
-    x_m: float
-    y_m: float
-    heading_rad: float
+    sequence: Sequence
+    x_m: Metres
+    y_m: Metres
+    heading_rad: Radians
     world: Ident
     bumps: Count
     recoveries: Count
@@ -168,15 +249,17 @@ class RobotState(Message):
     refused_actions: Count
     resent_observations: Count
     undecodable: Count
-    laps_left: Count
-    laps_right: Count
+    busy: Count
+    """Requests answered with "busy", and messages of more senders than are kept apart."""
+    laps_left: Few
+    laps_right: Few
     pending_changes: Count
     """Changes of the world that wait for their episode."""
     refused_changes: Count
     """Changes of the world that were refused, at once or when they were due."""
     blocks: Count = 0
     """How often the robot was found unfit to drive."""
-    reason: str = ""
+    reason: Annotated[str, Field(max_length=200)] = ""
     """Why it is not fit to drive now; empty when it is."""
     faults: Annotated[tuple[Fault, ...], Field(max_length=MAX_FAULTS)] = ()
     """What went wrong between driver and robot so far, the most frequent first."""
@@ -186,28 +269,29 @@ class Box(Message):
     """A box on the floor of a simulated world, in metres and degrees."""
 
     name: Ident
-    x_m: float
+    x_m: Metres
     """Place of its middle."""
-    y_m: float
-    heading_deg: float = 0.0
+    y_m: Metres
+    heading_deg: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
     """Direction along which `length_m` is measured."""
-    length_m: float
-    width_m: float
-    height_m: float
+    length_m: Metres
+    width_m: Metres
+    height_m: Metres
     rgb: Annotated[tuple[Channel, Channel, Channel], Field(strict=False)]
     """Red, green, blue, 0..255."""
 
 
 class WorldChange(Message):
-    """A change of a simulated robot's world. Anyone to driver, answered by `WorldChanged`.
+    """A change of a simulated robot's world. Operator to driver, answered by `WorldChanged`.
 
     Only what its kind needs is set: `world` (and `start`), `box`, or `name`.
     """
 
     id: Annotated[str, Field(pattern=r"^([0-9a-f]{12})?$")] = ""
     """Drawn by the sender. A change that is sent again with the same id is carried out once. If
-    empty, each one counts."""
-    kind: Literal["switch", "place", "remove"]
+    empty, each one counts. withdraw: the id of the waiting change that is not to come."""
+    kind: Literal["switch", "place", "remove", "withdraw", "list"]
+    """list only asks for the answer."""
     at_episode: Count = 0
     """Carried out in place of the first action whose `Action.episode` is at least this; 0: now."""
     world: Ident | None = None
@@ -222,15 +306,18 @@ class WorldChange(Message):
     @model_validator(mode="after")
     def _fits_kind(self) -> Self:
         given = {key for key in ("world", "box", "name") if getattr(self, key) is not None}
-        needed = {"switch": "world", "place": "box", "remove": "name"}[self.kind]
-        if given != {needed}:
+        needed = {"switch": {"world"}, "place": {"box"}, "remove": {"name"}}.get(self.kind, set())
+        if given != needed:
+            expected = ", ".join(needed) or "none of world, box, name"
             got = ", ".join(sorted(given)) or "neither"
-            raise ValueError(f"{self.kind}: expected {needed} and no other, got {got}")
+            raise ValueError(f"{self.kind}: expected {expected} and no other, got {got}")
+        if self.kind == "withdraw" and not self.id:
+            raise ValueError("withdraw: expected the id of a waiting change")
         return self
 
 
 class WorldChanged(Message):
-    """What became of a `WorldChange`, and the world as it is now. Driver to anyone."""
+    """What became of a `WorldChange`, and the world as it is now. Driver to operator."""
 
     accepted: bool
     """The change was carried out, or is kept until its episode."""
@@ -242,6 +329,8 @@ class WorldChanged(Message):
     """Names of its obstacles."""
     pending: Count
     """Changes that wait for their episode."""
+    waiting: Annotated[tuple[WorldChange, ...], Field(max_length=128)] = ()
+    """withdraw, list: these changes, in the order in which they are due."""
 
 
 # ---------------------------------------------------------------- actor -> replay
@@ -554,7 +643,7 @@ class Weights(Message):
 
 
 class ActorState(Message):
-    """Heartbeat of the actor, one per robot served. Actor to all."""
+    """Heartbeat of the actor, one per robot served. Actor to operator and watcher."""
 
     id: Ident
     life: Life
@@ -567,30 +656,52 @@ class ActorState(Message):
     actions: Count
     actions_per_s: float
     stale_observations: Count
+    rival_observations: Count
+    """Observations of another life of the robot while the one served was there."""
+    foreign_actions: Count
+    """Actions that the robot executed, but another actor had sent."""
+    refused_weights: Count
+    """Target networks that were not taken: of a wrong shape, not finite, or damaged."""
+    refused_episodes: Count
+    """Episodes that replay refused for good; they are lost."""
     dropped_samples: Count
     dropped_episodes: Count
     resent_episodes: Count
     undecodable: Count
+    busy: Count
     values: ActionValues
 
 
-class ServiceCommand(Message):
-    """Ask a service to stop cleanly. Anyone to any service, answered by `ServiceReply`."""
+class Ping(Message):
+    """Asks a service who it is. Anyone to any service, answered by `ServiceReply`."""
 
-    command: Literal["stop", "ping"]
+
+class StopService(Message):
+    """Asks a service to stop cleanly. Operator to any service, answered by `ServiceReply`."""
 
 
 class ServiceReply(Message):
-    """A service's answer to `ServiceCommand`: who it is."""
+    """Who a service is. Every life that has the role answers."""
 
     service: Ident
     id: Ident
     life: Life
+    host: Annotated[str, Field(max_length=255)]
     pid: Count
     protocol: Count
-    version: str
+    version: Annotated[str, Field(max_length=64)]
     config: Hash
-    uptime_s: float
+    uptime_s: Seconds
+    rivals: Count
+    """How often another life in the same role was met."""
+
+
+class Refusal(Message):
+    """The content of an error reply to any request."""
+
+    final: bool
+    """The same request will be refused again; otherwise it may be sent again after a moment."""
+    reason: Annotated[str, Field(max_length=300)]
 
 
 EpisodeAck.model_rebuild()

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import secrets
 import signal
+import socket
 import sys
 import threading
 import time
@@ -15,22 +17,28 @@ from pathlib import Path
 from types import FrameType
 from typing import TypeVar
 
+from shared import roles
 from shared.bus import Bus
 from shared.config import Config
 from shared.errors import (
     BusError,
     ConfigError,
     CorridorError,
+    PeerRefused,
     RobotMissing,
+    RoleTaken,
     RouterMissing,
     StateError,
 )
+from shared.halt_keeper import HaltKeeper
 from shared.inbox import Inbox
-from shared.keys import SERVICE
-from shared.messages import PROTOCOL_VERSION, ServiceCommand, ServiceReply
+from shared.keys import PING, STOP
+from shared.messages import PROTOCOL_VERSION, ServiceReply, StopService
 
 VERSION = "0.1.0"
-EXIT_OK, EXIT_CRASH, EXIT_CONFIG, EXIT_STATE = 0, 1, 2, 3
+EXIT_OK, EXIT_CRASH, EXIT_CONFIG, EXIT_STATE, EXIT_ROLE = 0, 1, 2, 3, 4
+REJOIN_S = 10.0
+"""After a sleep longer than its lease a process looks so long whether its role was taken."""
 TICK_S = 0.2
 """Longest a service waits before it looks at its stop flag."""
 T = TypeVar("T")
@@ -56,12 +64,20 @@ class Service:
         self.config, self.bus, self.stop = config, bus, stop
         self.started_s = time.monotonic()
         self.log = logging.getLogger(name)
+        self.rivals = 0
+        """How often another life in this role was met."""
+        self.taken_by = ""
+        """Who has the role, if this process lost it."""
 
     def meet(self) -> None:
-        """Become visible, after checking that everybody here speaks the same protocol and config.
+        """Win the role and become visible, where everybody speaks the same protocol and config.
 
-        Raises ConfigError naming the first peer that differs.
+        Raises RoleTaken naming who has the role, or ConfigError naming the first peer that differs.
         """
+        with roles.claimed(self.bus, self.name, self.ident, self.life):
+            self._meet_others()
+
+    def _meet_others(self) -> None:
         fingerprint = self.config.fingerprint()
         for peer in self.bus.peers():
             if peer.protocol != str(PROTOCOL_VERSION):
@@ -77,15 +93,27 @@ class Service:
         self.bus.announce(self.name, self.ident, self.life, PROTOCOL_VERSION, fingerprint)
 
     def serve_control(self, inbox: Inbox) -> None:
-        """Answer `ping` and `stop` until stopped (runs in a thread of its own)."""
+        """Answer `ping` and `stop`, and watch over the role (runs in a thread of its own)."""
+        known, looked_s, woke_s = frozenset({self.life}), time.monotonic(), -math.inf
         while not self.stop.is_set():
             inbox.wait(TICK_S)
             for request in inbox.requests():
                 with request:
-                    if isinstance(request.message, ServiceCommand):
-                        request.reply(self.describe())
-                        if request.message.command == "stop":
-                            self.stop.set("asked to stop")
+                    request.reply(self.describe())
+                    if isinstance(request.message, StopService):
+                        self.stop.set("asked to stop")
+            lives = inbox.lives(self.name, self.ident)
+            for life in lives - known:
+                self.rivals += 1
+                self.log.error("another %s %r is here: life %s", self.name, self.ident, life)
+            known = lives | {self.life}
+            away_s, looked_s = time.monotonic() - looked_s, time.monotonic()
+            if away_s > self.config.bus.lease_ms / 1000:
+                woke_s = looked_s
+            if len(known) > 1 and looked_s - woke_s < REJOIN_S:
+                # The role ended with the lease: whoever has it now keeps it.
+                self.taken_by = ", ".join(sorted(known - {self.life}))
+                self.stop.set("slept longer than its lease, and its role is taken by life")
 
     def describe(self) -> ServiceReply:
         """Who this service is."""
@@ -93,15 +121,20 @@ class Service:
             service=self.name,
             id=self.ident,
             life=self.life,
+            host=socket.gethostname(),
             pid=os.getpid(),
             protocol=PROTOCOL_VERSION,
             version=VERSION,
             config=self.config.fingerprint(),
             uptime_s=time.monotonic() - self.started_s,
+            rivals=self.rivals,
         )
 
     def insist(self, what: str, attempt: Callable[[], T]) -> T:
-        """Repeat a request until it is answered; log when it takes long. Raises Stopped."""
+        """Repeat a request until it is answered; log when it takes long.
+
+        Raises Stopped, and PeerRefused when it was refused for good.
+        """
         start_s, next_report_s = time.monotonic(), 5.0
         while True:
             if self.stop.is_set():
@@ -109,6 +142,8 @@ class Service:
             try:
                 return attempt()
             except BusError as error:
+                if isinstance(error, PeerRefused) and error.final:
+                    raise
                 waited_s = time.monotonic() - start_s
                 if waited_s > next_report_s:
                     self.log.warning("still waiting to %s after %.0f s: %s", what, waited_s, error)
@@ -179,23 +214,36 @@ def answer_signals(stop: StopFlag) -> None:
 
 
 @contextmanager
-def service(name: str, ident: str, config: Config, *, life: str | None = None) -> Iterator[Service]:
-    """Connect, meet the others and become visible; stop threads and close the bus at the end."""
+def service(
+    name: str, ident: str, config: Config, *, life: str | None = None, halts: Path | None = None
+) -> Iterator[Service]:
+    """Connect, win the role and become visible; stop threads and close the bus at the end.
+
+    halts: the run folder, in which a service without a robot keeps the halts that it hears of.
+
+    Raises RoleTaken, also at the end if the role was lost meanwhile, and ConfigError.
+    """
     stop = StopFlag()
     answer_signals(stop)
     with _connect(name, config, stop) as bus:
         me = Service(name, ident, life or new_life(), config, bus, stop)
         me.meet()
         with controlled(me):
+            if halts is not None:
+                HaltKeeper(me, halts)
             me.log.info("%s %r of run %r is up (life %s)", name, ident, config.run.name, me.life)
             yield me
+    if me.taken_by:
+        raise RoleTaken(f"{name} {ident!r} of run {config.run.name!r}: {stop.reason} {me.taken_by}")
 
 
 @contextmanager
 def controlled(me: Service) -> Iterator[None]:
     """Answer `ping` and `stop` while the block runs; the stop flag is set at its end."""
     control = me.bus.inbox()
-    control.serve(SERVICE, f"{me.name}-{me.ident}")
+    for stream in (PING, STOP):
+        control.serve(stream, f"{me.name}-{me.ident}")
+    control.watch(me.name, me.ident)
     thread = threading.Thread(target=me.serve_control, args=(control,), daemon=True)
     thread.start()
     try:
@@ -236,9 +284,10 @@ def guarded(name: str, main: Callable[[], None]) -> int:
         main()
     except Stopped:
         return EXIT_OK
-    except (ConfigError, StateError) as error:
+    except (ConfigError, StateError, RoleTaken) as error:
         log.error("%s", error)
-        return EXIT_CONFIG if isinstance(error, ConfigError) else EXIT_STATE
+        codes = {ConfigError: EXIT_CONFIG, StateError: EXIT_STATE, RoleTaken: EXIT_ROLE}
+        return codes[type(error)]
     except RobotMissing as error:
         log.error("%s", error)
         return EXIT_CRASH

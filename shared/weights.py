@@ -55,6 +55,7 @@ class WeightsFetcher(threading.Thread):
         self._inbox.subscribe(LEARNER_STATE, "main")
         self._newer = threading.Condition()
         self._newest: tuple[int, bytes] = (0, b"")
+        self.refused = 0
         me.stop.on_set(self._inbox.wake)
         self.start()
 

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from services.robot_driver.driver import Driver
 from shared.config import Config
 from shared.facts import IMAGE_BYTES, IMAGE_SHAPE
-from shared.messages import Episode, Observation
+from shared.messages import Episode, HaltKind, Observation
 from shared.rl.memory import MIRROR, SAMPLE, ReplayMemory, SampleStore
 
 Images = npt.NDArray[np.uint8]
@@ -79,6 +80,15 @@ def make_observation(sequence: int, **given: Any) -> Observation:
         "stamp_s": 0.0,
     }
     return Observation(**{**plain, **given})
+
+
+def command(driver: Driver, order: str) -> None:
+    """What an operator's estop, clear, pause or resume does to a driver."""
+    kinds: set[HaltKind] = set()
+    kinds |= {"estop"} if driver.safety.estop else set()
+    kinds |= {"pause"} if driver.safety.paused else set()
+    kind: HaltKind = "estop" if order in ("estop", "clear") else "pause"
+    driver.hold(kinds | {kind} if order in ("estop", "pause") else kinds - {kind})
 
 
 def make_episode(n: int, *, seed: int = 0, images: Images | None = None, **given: Any) -> Episode:

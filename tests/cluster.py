@@ -103,6 +103,15 @@ class Cluster:
         place = ("--run-dir", str(self.folder), "--set", f"robot.id={robot}")
         self._launch(f"driver-{robot}", "driver", *place)
 
+    def run_to_its_end(self, service: str, name: str) -> int | None:
+        """Start a service as `start` does, under another name, and wait for its exit code."""
+        self._launch(name, service, "--run-dir", str(self.folder))
+        return self.ended(name, 20)
+
+    def ended(self, name: str, timeout_s: float) -> int | None:
+        """The exit code of a process that ends by itself."""
+        return self._processes[name].wait(timeout_s)
+
     def _launch(self, name: str, service: str, *options: str) -> None:
         self._forget(name)
         self.folder.mkdir(parents=True, exist_ok=True)

@@ -10,8 +10,10 @@ from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from shared.bus import Bus
 from shared.config import BusConfig, Config
-from shared.keys import SERVICE, Stream
-from shared.messages import Message, ServiceReply
+from shared.halts import HaltBook, means
+from shared.keys import HALT, PING, RELEASE, STOP, Stream
+from shared.messages import PROTOCOL_VERSION, Halts, Message, Release, ServiceReply, Standing
+from shared.service import new_life
 
 M = TypeVar("M", bound=Message)
 TEXTS = {"life": "0" * 12, "hash": "0" * 16, "config": "0" * 16}
@@ -46,18 +48,21 @@ def _plain(name: str, annotation: Any, least: int = 1) -> Any:
         return None
     if hasattr(annotation, "__metadata__"):
         return _plain(name, arguments[0])
+    if isinstance(annotation, type) and issubclass(annotation, Message):
+        return message(annotation)
     return annotation()
 
 
 @contextmanager
 def answering(
-    config: BusConfig, run: str, stream: Stream, ident: str, answer: Callable[[Message], Message]
+    config: BusConfig, run: str, ident: str, answer: Callable[[Message], Message], *streams: Stream
 ) -> Iterator[Bus]:
-    """Answer every request of one stream from a thread while the block runs; yields the bus."""
+    """Answer every request of some streams from a thread while the block runs; yields the bus."""
     done = threading.Event()
     with Bus(config, run) as bus:
         inbox = bus.inbox()
-        inbox.serve(stream, ident)
+        for stream in streams:
+            inbox.serve(stream, ident)
 
         def serve() -> None:
             while not done.is_set():
@@ -75,6 +80,44 @@ def answering(
             thread.join()
 
 
+class FakeDriver:
+    """Keeps a book of halts, as a driver does; refuses the first few."""
+
+    def __init__(self, name: str, refusals: int) -> None:
+        self.name, self.life = name, new_life()
+        self.book, self.asked, self._refusals = HaltBook(name), 0, refusals
+
+    def answer(self, request: Message) -> Standing:
+        """Take up a halt or a release."""
+        self.asked += 1
+        if self.asked > self._refusals:
+            if isinstance(request, Halts):
+                self.book.add(request.halts)
+            elif isinstance(request, Release) and means(request, self.life, 0.0):
+                self.book.release(request.numbers, request.robot)
+        kinds = self.book.kinds(self.name)
+        return message(
+            Standing,
+            service="driver",
+            id=self.name,
+            life=self.life,
+            clock_s=0.0,
+            state="estop" if "estop" in kinds else "paused" if kinds else "waiting",
+            stands=bool(kinds),
+            halts=self.book.holding(self.name),
+        )
+
+
+@contextmanager
+def fake_driver(config: Config, robot: str, *, refusals: int = 0) -> Iterator[FakeDriver]:
+    """A driver that is visible and answers halts and releases; it may refuse the first few."""
+    driver = FakeDriver(robot, refusals)
+    run = config.run.name
+    with answering(config.bus, run, "main", driver.answer, HALT, RELEASE) as bus:
+        bus.announce("driver", robot, driver.life, PROTOCOL_VERSION, config.fingerprint())
+        yield driver
+
+
 @contextmanager
 def fake_service(
     config: Config, service: str, ident: str, commands: list[Message]
@@ -89,6 +132,6 @@ def fake_service(
         return reply
 
     stream_id = f"{service}-{ident}"
-    with answering(config.bus, config.run.name, SERVICE, stream_id, answer) as bus:
-        bus.announce(service, ident, "0" * 12, 1, config.fingerprint())
+    with answering(config.bus, config.run.name, stream_id, answer, PING, STOP) as bus:
+        bus.announce(service, ident, "0" * 12, PROTOCOL_VERSION, config.fingerprint())
         yield bus

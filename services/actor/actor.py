@@ -35,6 +35,10 @@ class Actor:
         self.predictor = predictor
         """The target network that acts; replace it `at_boundary` only."""
         self.life = life
+        self._lives = {life}
+        """The own life, and those that it continues: their actions are its own."""
+        self.foreign_actions = 0
+        """Actions that the robot executed, but another actor had sent."""
         self.open = OpenEpisode(config.episode)
         self.progress: RobotProgress | None = None
         self.submissions = 0
@@ -63,29 +67,48 @@ class Actor:
         """Start with what replay has of this robot; count what an earlier actor process lost.
 
         Every executed action after the newest stored sample was gathered by a process that is gone:
-        the driver's numbering tells how many there were.
+        the driver's numbering tells how many there were. Steps that were restored go on, unless
+        replay has got samples of the robot since: then another process went on with them.
         """
         self.progress = progress
         if self._expected is not None:
-            return  # after a clean stop nothing is lost but what `finish` finds interrupted
+            if self._follows(progress, observation):
+                return  # after a clean stop nothing is lost but what `finish` finds interrupted
+            self.open, self._expected = OpenEpisode(self._config.episode), None
+            self._actions_before, self.at_boundary = self.actions, True
         self._laps_before = (observation.laps_left, observation.laps_right)
-        if progress.robot_life in ("", observation.life):
+        if progress.robot_life in ("", observation.life, *observation.earlier):
             lost = observation.sequence - (progress.last_sequence + 1)
             self._drop(samples=lost, episodes=int(lost > 0))
         else:  # what the driver's earlier life executed unstored cannot be known any more
             self._drop(samples=observation.sequence, episodes=1)
 
+    def _follows(self, progress: RobotProgress, observation: Observation) -> bool:
+        """Whether the open steps come after all that replay has of the robot."""
+        assert self._expected is not None
+        life, number = self._expected
+        lives = ("", life, observation.life, *observation.earlier)
+        first = self.open.steps[0].sequence if len(self.open) else number
+        return progress.robot_life in lives and first > progress.last_sequence
+
     def finish(self, observation: Observation) -> Episode | None:
         """End the open episode if this observation ends it; return what is to be stored.
 
         None when the episode goes on, or when it ended without releasing a sample. A step whose
-        action the robot did not carry out (a late answer, a contact or a halt first) is taken
-        back first: it is neither an action nor a sample.
+        action the robot did not carry out (a late answer, a contact or a halt first, or another
+        actor's action in its place) is taken back first: it is neither an action nor a sample.
         """
+        if self._expected is not None and self._expected[0] in observation.earlier:
+            self._expected = (observation.life, self._expected[1])
         if len(self.open) and self._unexecuted(self.open.steps[-1], observation):
             self.open.retract()
             self.actions -= 1
             self._expected = (observation.life, observation.sequence)
+        elif len(self.open) and self._displaced(self.open.steps[-1], observation):
+            self.foreign_actions += 1
+            self.open.retract()
+            self.actions -= 1
+            self._expected = (observation.life, -1)
         ending = self._ending(observation)
         if ending is None:
             return None
@@ -102,6 +125,12 @@ class Actor:
         self.progress = progress
         self.submissions += 1
         self._unreported_samples = self._unreported_episodes = 0
+
+    def lose(self, episode: Episode) -> None:
+        """The last submission was refused for good: its samples are lost, and counted."""
+        self.progress = None
+        self.submissions += 1
+        self._drop(samples=episode.count, episodes=1)
 
     def act(self, observation: Observation, values: Values | None = None) -> Action:
         """Choose an action with the current target network and append the step (A11, A26).
@@ -166,8 +195,8 @@ class Actor:
     def state(self) -> dict[str, Any]:
         """Everything a later process needs to continue exactly here, for msgpack."""
         return {
-            "life": self.life,
-            "submissions": self.submissions,
+            "lives": sorted(self._lives),
+            "foreign_actions": self.foreign_actions,
             "actions": self.actions,
             "dropped": [self.dropped_samples, self.dropped_episodes],
             "unreported": [self._unreported_samples, self._unreported_episodes],
@@ -179,9 +208,12 @@ class Actor:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from `state()`. Raises KeyError, TypeError or ValueError when it is damaged."""
-        self.life = str(state["life"])
-        self.submissions, self.actions = int(state["submissions"]), int(state["actions"])
+        """Continue, in a life of one's own, from `state()`.
+
+        Raises KeyError, TypeError or ValueError when it is damaged.
+        """
+        self._lives = {self.life, *map(str, state["lives"])}
+        self.foreign_actions, self.actions = int(state["foreign_actions"]), int(state["actions"])
         self.dropped_samples, self.dropped_episodes = state["dropped"]
         self._unreported_samples, self._unreported_episodes = state["unreported"]
         self._actions_before = int(state["actions_before"])
@@ -198,6 +230,13 @@ class Actor:
         """Whether the driver waits, once more, for the action that this step had chosen."""
         place = (observation.life, observation.sequence + 1)
         return self._expected == place and newest.sequence == observation.sequence
+
+    def _displaced(self, newest: Step, observation: Observation) -> bool:
+        """Whether the robot executed something else in place of this step's action."""
+        if self._expected != (observation.life, observation.sequence):
+            return False  # it goes on elsewhere: that is an interruption, told by the numbers
+        own = observation.action == newest.action and observation.actor_life in self._lives
+        return not own
 
     def _ending(self, observation: Observation) -> Ending | None:
         """How this observation ends the open episode, if it does (A9, E6, E10, E11, E42)."""

@@ -1,4 +1,4 @@
-"""Hands episodes to replay beside the loop: one robot's episode holds up no other robot."""
+"""Talks to replay beside the loop: what one robot waits for holds up no other robot."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
-from shared.keys import EPISODE
-from shared.messages import Episode, EpisodeAck
+from shared.keys import EPISODE, PROGRESS
+from shared.messages import Episode, EpisodeAck, ProgressRequest, RobotProgress
 from shared.service import Service
 
 AT_ONCE = 4
@@ -23,17 +23,35 @@ class Delivery:
 
 
 class Courier:
-    """Sends an episode until it is acknowledged; `notify` is called then, from its own thread."""
+    """Asks until there is an answer; `notify` is called then, from a thread of the courier."""
 
     def __init__(self, me: Service, notify: Callable[[], None]) -> None:
         self._me, self._notify = me, notify
         self._pool = ThreadPoolExecutor(AT_ONCE, "courier")
 
     def send(self, episode: Episode) -> Future[Delivery]:
-        """Begin to hand over an episode. The future raises Stopped when the service stops first."""
+        """Begin to hand over an episode.
+
+        The future raises Stopped when the service stops first, and PeerRefused when replay refuses
+        it for good.
+        """
         future = self._pool.submit(self._deliver, episode)
         future.add_done_callback(lambda _: self._notify())
         return future
+
+    def ask(self, robot: str) -> Future[RobotProgress]:
+        """Begin to ask where a robot was. The future raises like that of `send`."""
+        future = self._pool.submit(self._progress, robot)
+        future.add_done_callback(lambda _: self._notify())
+        return future
+
+    def _progress(self, robot: str) -> RobotProgress:
+        def attempt() -> RobotProgress:
+            return self._me.bus.request(
+                PROGRESS, ProgressRequest(robot=robot), RobotProgress, ident=robot
+            )
+
+        return self._me.insist("ask replay for the robot's progress", attempt)
 
     def _deliver(self, episode: Episode) -> Delivery:
         attempts = 0
@@ -41,6 +59,6 @@ class Courier:
         def attempt() -> EpisodeAck:
             nonlocal attempts
             attempts += 1
-            return self._me.bus.request(EPISODE, episode, EpisodeAck)
+            return self._me.bus.request(EPISODE, episode, EpisodeAck, ident=episode.robot)
 
         return Delivery(self._me.insist("hand an episode to replay", attempt), attempts)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,9 @@ import numpy as np
 from services.actor.courier import Courier
 from services.actor.session import Newest, Session
 from services.actor.targets import Targets
+from services.processes import DRIVER, LEARNER, MAIN
 from shared.config import Config, Numerics
+from shared.errors import CorridorError
 from shared.inbox import Inbox
 from shared.keys import ACTOR_STATE, LEARNER_STATE, OBSERVATION
 from shared.messages import (
@@ -26,12 +29,14 @@ from shared.service import TICK_S, Service, Stopped, service
 from shared.weights import WeightsFetcher
 
 MAX_ROBOTS = 32
-"""Robots one actor serves; observations of more are refused and counted."""
+"""Robots one actor serves; observations of more are counted as busy."""
+AGAIN_S = 1.0
+"""Rest of a robot after an error ended its session."""
 
 
-def run(config: Config, folder: Path) -> None:
+def run(config: Config, folder: Path, life: str) -> None:
     """Serve robots until stopped; a clean stop saves the open episodes."""
-    with service("actor", "main", config) as me:
+    with service("actor", MAIN, config, life=life, halts=folder) as me:
         loop = ActorLoop(me, folder / "actor", settle(config, folder, "actor"))
         with suppress(Stopped):
             loop.run()
@@ -46,9 +51,13 @@ class ActorLoop:
         self._targets = Targets(me.config.network, numerics)
         self._newest = Newest()
         self._sessions: dict[str, Session] = {}
+        self._failed: dict[str, float] = {}
+        """When the session of a robot ended with an error."""
         self._inbox: Inbox = me.bus.inbox()
         self._inbox.subscribe(OBSERVATION)
-        self._inbox.subscribe(LEARNER_STATE, "main")
+        self._inbox.subscribe(LEARNER_STATE, MAIN)
+        self._inbox.watch(LEARNER.name, MAIN)
+        self._inbox.watch(DRIVER.name)
         self._weights = WeightsFetcher(me, self._inbox.wake)
         self._courier = Courier(me, self._inbox.wake)
         me.stop.on_set(self._inbox.wake)
@@ -59,26 +68,48 @@ class ActorLoop:
         while not self._me.stop.is_set():
             self._inbox.wait(TICK_S)
             for _, state in self._inbox.take(LEARNER_STATE, LearnerState):
-                self._newest.note(state)
+                self._newest.note(state, self._inbox.lives(LEARNER.name, MAIN))
             for robot, observation in self._inbox.take(OBSERVATION, Observation):
-                if robot in self._sessions or len(self._sessions) < MAX_ROBOTS:
-                    self._session(robot).offer(observation)
+                if self._has_room(robot):
+                    with self._alone(robot):
+                        self._session(robot).offer(observation)
                 else:
-                    self._inbox.refused[OBSERVATION.name] += 1
+                    self._inbox.busy[OBSERVATION.name] += 1
             self._answer()
             self._beat()
+
+    def _has_room(self, robot: str) -> bool:
+        """Whether the robot is served, or can be now."""
+        failed_s = self._failed.get(robot, -AGAIN_S)
+        rested = time.monotonic() - failed_s > AGAIN_S
+        return robot in self._sessions or (rested and len(self._sessions) < MAX_ROBOTS)
+
+    @contextmanager
+    def _alone(self, robot: str) -> Iterator[None]:
+        """Let what goes wrong with one robot end its session, and nothing else.
+
+        The session begins anew, from what replay has, with the next observation after a while.
+        """
+        try:
+            yield
+        except (CorridorError, ValueError, TypeError, LookupError, ArithmeticError) as error:
+            self._me.log.error("robot %r: its session ends: %s", robot, error, exc_info=True)
+            self._sessions.pop(robot, None)
+            self._failed[robot] = time.monotonic()
 
     def _answer(self) -> None:
         """Let every robot's turn go on; images seen with the same weights share a pass."""
         waiting: defaultdict[Predictor, list[tuple[Session, Observation]]] = defaultdict(list)
-        for session in self._sessions.values():
-            if (observation := session.advance()) is not None:
-                waiting[session.actor.predictor].append((session, observation))
+        for robot, session in list(self._sessions.items()):
+            with self._alone(robot):
+                if (observation := session.advance()) is not None:
+                    waiting[session.actor.predictor].append((session, observation))
         for predictor, turns in waiting.items():
             images = np.stack([image_array(observation.image) for _, observation in turns])
             values = predictor.all_values(images)
             for (session, observation), its_own in zip(turns, values, strict=True):
-                session.answer(observation, its_own)
+                with self._alone(observation.robot):
+                    session.answer(observation, its_own)
 
     def save(self) -> None:
         """Save all robots' open episodes."""
@@ -89,7 +120,14 @@ class ActorLoop:
         if robot not in self._sessions:
             path = self._folder / f"{robot}.msgpack"
             self._sessions[robot] = Session(
-                self._me, robot, path, self._newest, self._weights, self._targets, self._courier
+                self._me,
+                robot,
+                path,
+                self._newest,
+                self._weights,
+                self._targets,
+                self._courier,
+                lambda: self._inbox.lives(DRIVER.name, robot),
             )
             self._me.log.info("serving robot %r", robot)
         return self._sessions[robot]
@@ -100,5 +138,5 @@ class ActorLoop:
             return
         self._next_beat_s = now_s + self._me.config.bus.heartbeat_s
         for robot, session in self._sessions.items():
-            state = session.heartbeat(self._inbox.refused_total)
+            state = session.heartbeat(self._inbox.refused_total, self._inbox.busy_total)
             self._me.bus.publish(ACTOR_STATE, state, robot)

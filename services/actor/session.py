@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections.abc import Callable, Collection
 from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,22 +14,23 @@ from services.actor.courier import Courier, Delivery
 from services.actor.targets import Targets
 from shared import statefile
 from shared.codec import decode, encode
-from shared.errors import BadMessage, StateError
+from shared.errors import BadMessage, PeerRefused, StateError
 from shared.facts import ACTION_COUNT
-from shared.keys import ACTION, PROGRESS
+from shared.keys import ACTION
 from shared.messages import (
     Action,
     ActorState,
     Episode,
     LearnerState,
     Observation,
-    ProgressRequest,
     RobotProgress,
 )
 from shared.rl.policy import Values
 from shared.service import Service, new_life
 from shared.weights import WeightsFetcher
 
+RIVAL_SILENT_S = 2.0
+"""After this time another life of a robot is served if the one before is not heard any more."""
 Phase = Literal["waiting", "filling", "driving", "handing-over", "training", "stopped"]
 
 
@@ -39,13 +40,12 @@ class Newest:
 
     state: LearnerState | None = None
 
-    def note(self, state: LearnerState) -> None:
-        """Take over a state unless it is older: neither number ever falls, so it came late."""
-        known = self.state
-        if known is None or (state.episode, state.weights_version) >= (
-            known.episode,
-            known.weights_version,
-        ):
+    def note(self, state: LearnerState, lives: Collection[str]) -> None:
+        """Take over a state, unless it is of none of the lives that have the learner's role.
+
+        Without any token of a learner each is believed.
+        """
+        if not lives or state.life in lives:
             self.state = state
 
 
@@ -61,11 +61,16 @@ class Session:
         weights: WeightsFetcher,
         targets: Targets,
         courier: Courier,
+        lives: Callable[[], Collection[str]],
     ) -> None:
+        """Begin to serve a robot; `lives` tells which of its driver's lives have the role now."""
         self._me, self._robot, self._path = me, robot, path
         self._newest, self._weights, self._targets = newest, weights, targets
-        self._courier = courier
+        self._courier, self._lives = courier, lives
         self._delivery: Future[Delivery] | None = None
+        self._asked: Future[RobotProgress] | None = None
+        self._restored = False
+        """The open episode is of an earlier process; `Actor.begin` has not judged it yet."""
         self.actor = Actor(me.config, robot, new_life(), targets.none)
         self._pending: Episode | None = None
         """Finished, not yet acknowledged."""
@@ -74,18 +79,20 @@ class Session:
         self._finished: Observation | None = None
         """The newest observation that was asked whether it ends the open episode."""
         self._answered: tuple[tuple[str, int, int], Action] | None = None
-        self._life = ""
-        self._past_lives: deque[str] = deque(maxlen=100)
-        """Driver processes that are gone: what still comes of them is late."""
-        self.stale_observations = 0
-        self.resent_episodes = 0
+        self._life, self._heard_s = "", 0.0
+        """The life that is served, and when it was last heard of."""
+        self.stale_observations = self.rival_observations = 0
+        self.resent_episodes = self.refused_episodes = 0
         self._counted = (time.monotonic(), 0)
         saved = statefile.take(path)
         if saved is not None:
             self._restore(saved)
 
     def offer(self, observation: Observation) -> None:
-        """Take an observation from the inbox: new, repeated, or outdated."""
+        """Take an observation from the inbox: new, repeated, outdated, or of a rival."""
+        if not self._serves(observation):
+            self.rival_observations += 1
+            return
         place = (observation.life, observation.sequence, observation.attempt)
         if self._answered is not None and self._answered[0] == place:
             self._publish(self._answered[1])  # our answer was lost
@@ -93,30 +100,47 @@ class Session:
         if self._answered and self._answered[0][0] == place[0] and place < self._answered[0]:
             self.stale_observations += 1
             return
-        if observation.life in self._past_lives:
-            self.stale_observations += 1
-            return
-        if self._life and observation.life != self._life:
-            self._past_lives.append(self._life)
-        self._life = observation.life
         if self._observation is None or place != self._place(self._observation):
             self._observation = observation
             if self.actor.progress is not None:
                 self._finish(observation)
 
+    def _serves(self, observation: Observation) -> bool:
+        """Whether this life is the one to serve: one at a time, and none is silenced for good.
+
+        Another life takes over if it continues the one before, if only it has the driver's role, or
+        if the one before has been silent for `RIVAL_SILENT_S`.
+        """
+        now_s, life = time.monotonic(), observation.life
+        if life != self._life:
+            present = self._lives()
+            takes_over = life in present and self._life not in present
+            silent = now_s - self._heard_s > RIVAL_SILENT_S
+            if self._life and not (self._life in observation.earlier or takes_over or silent):
+                return False
+            self._life = life
+        self._heard_s = now_s
+        return True
+
     def advance(self) -> Observation | None:
-        """Do what can be done now: hand over, wait for training. Raises Stopped.
+        """Do what can be done now: hand over, wait for training. Raises Stopped and StateError.
 
         Returns the observation that may be answered now, if there is one: see `answer`.
         """
         if self._observation is None:
             return None
-        if self.actor.progress is None:
-            self._begin(self._observation)
+        if self.actor.progress is None and not self._begun(self._observation):
+            self._hold(self._observation)
+            return None
         while self._pending is not None:
             if not self._handed_over(self._pending):
                 self._hold(self._observation)
                 return None
+            if self.actor.progress is None:  # it was refused: replay says where to go on
+                return None
+            if self._restored:
+                self.actor.begin(self.actor.progress, self._observation)
+                self._restored = False
             self._finish(self._observation)  # it may have come meanwhile
         if self._may_act():
             return self._observation
@@ -130,11 +154,12 @@ class Session:
         self._observation = None
         self._publish(action)
 
-    def heartbeat(self, undecodable: int) -> ActorState:
+    def heartbeat(self, undecodable: int, busy: int) -> ActorState:
         """What the actor tells of this robot.
 
         Args:
-            undecodable: messages the actor could not take, of all robots together.
+            undecodable: messages that the actor could not take, of all robots together.
+            busy: messages for which it had no room.
         """
         now_s, (then_s, count) = time.monotonic(), self._counted
         rate = (self.actor.actions - count) / max(now_s - then_s, 1e-6)
@@ -151,10 +176,15 @@ class Session:
             actions=self.actor.actions,
             actions_per_s=rate,
             stale_observations=self.stale_observations,
+            rival_observations=self.rival_observations,
+            foreign_actions=self.actor.foreign_actions,
+            refused_weights=self._weights.refused,
+            refused_episodes=self.refused_episodes,
             dropped_samples=self.actor.dropped_samples,
             dropped_episodes=self.actor.dropped_episodes,
             resent_episodes=self.resent_episodes,
             undecodable=undecodable,
+            busy=busy,
             values=action.values if action else (0.0,) * ACTION_COUNT,
         )
 
@@ -170,6 +200,7 @@ class Session:
     def _restore(self, saved: dict[str, Any]) -> None:
         try:
             self.actor.restore(saved["actor"])
+            self._restored = True
             self.resent_episodes = int(saved["resent_episodes"])
             if "pending" in saved:
                 self._pending = decode(saved["pending"], Episode)
@@ -179,18 +210,20 @@ class Session:
         except (KeyError, TypeError, ValueError, BadMessage) as error:
             raise StateError(f"{self._path}: saved actor state does not fit: {error}") from error
 
-    def _begin(self, observation: Observation) -> None:
-        """Learn from replay where this robot was, and load weights."""
-        progress = self._me.insist("ask replay for the robot's progress", self._ask_progress)
+    def _begun(self, observation: Observation) -> bool:
+        """Learn from replay where this robot was; whether the answer is there. Raises Stopped."""
+        if self._asked is None:
+            self._asked = self._courier.ask(self._robot)
+        if not self._asked.done():
+            return False
+        progress, self._asked = self._asked.result(), None
         if self._pending is None:
             self.actor.begin(progress, observation)
+            self._restored = False
             self._finish(observation)
         else:
             self.actor.progress = progress
-
-    def _ask_progress(self) -> RobotProgress:
-        request = ProgressRequest(robot=self._robot)
-        return self._me.bus.request(PROGRESS, request, RobotProgress)
+        return True
 
     def _finish(self, observation: Observation) -> None:
         """End the open episode if this observation ends it. It needs the weights of the episode.
@@ -204,17 +237,27 @@ class Session:
         self._pending, self._finished = self.actor.finish(observation), observation
 
     def _handed_over(self, episode: Episode) -> bool:
-        """Whether the episode is acknowledged: then it is on disk, exactly once. Raises Stopped."""
+        """Whether the episode is acknowledged: then it is on disk, exactly once. Raises Stopped.
+
+        One that is refused for good is given up, told of and counted: the robot goes on.
+        """
         if self._delivery is None:
             self._delivery = self._courier.send(episode)
         if not self._delivery.done():
             return False
-        delivered, self._delivery = self._delivery.result(), None
-        ack = delivered.ack
-        self.resent_episodes += delivered.attempts - 1
-        if not ack.accepted or ack.progress is None:
-            raise StateError(f"replay refused episode {episode.number}: {ack.reason}")
-        self.actor.committed(ack.progress)
+        delivery, self._delivery = self._delivery, None
+        try:
+            delivered = delivery.result()
+            self.resent_episodes += delivered.attempts - 1
+            progress, reason = delivered.ack.progress, delivered.ack.reason
+        except PeerRefused as error:
+            progress, reason = None, str(error)
+        if progress is None:
+            self._me.log.error("%s: episode %d lost: %s", self._robot, episode.number, reason)
+            self.refused_episodes += 1
+            self.actor.lose(episode)
+        else:
+            self.actor.committed(progress)
         self._pending = None
         return True
 

@@ -4,7 +4,7 @@ Commands import what they need when they run, so that `corridor driver` works wi
 `corridor actor` works without pybullet, and `--help` is quick.
 
 Exit codes: 0 done, 1 crash or no answer, 2 wrong configuration or usage (told in one line), 3 the
-state on disk is damaged or does not belong to this run.
+state on disk is damaged or does not belong to this run, 4 another process has the role.
 """
 
 from __future__ import annotations
@@ -17,16 +17,17 @@ import typer
 
 from services.cli import driving, experiments, run, services
 from services.cli.emulate import emulate
-from services.cli.options import EXIT_CONFIG, EXIT_CRASH, EXIT_STATE
+from services.cli.options import EXIT_CONFIG, EXIT_CRASH, EXIT_ROLE, EXIT_STATE
 from services.cli.worlds import obstacle, world
-from shared.errors import ConfigError, CorridorError, StateError
+from shared.errors import ConfigError, CorridorError, RoleTaken, StateError
 
 UsageError: Any = typer.BadParameter.__mro__[2]
 """Base of all complaints about the command line, wherever this version of Typer keeps Click."""
 
 app = typer.Typer(
     help="A robot teaches itself to drive through corridors from one camera.",
-    epilog="Exit codes: 0 done, 1 crash or no answer, 2 wrong configuration or usage, 3 bad state.",
+    epilog="Exit codes: 0 done, 1 crash or no answer, 2 wrong configuration or usage, 3 bad state, "
+    "4 role taken.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -46,6 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(str(error), EXIT_CONFIG)
     except StateError as error:
         return _fail(str(error), EXIT_STATE)
+    except RoleTaken as error:
+        return _fail(str(error), EXIT_ROLE)
     except CorridorError as error:
         return _fail(str(error), EXIT_CRASH)
     except UsageError as error:

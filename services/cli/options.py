@@ -15,7 +15,7 @@ from shared.errors import ConfigError
 if TYPE_CHECKING:
     from shared.config import Config
 
-EXIT_CRASH, EXIT_CONFIG, EXIT_STATE = 1, 2, 3
+EXIT_CRASH, EXIT_CONFIG, EXIT_STATE, EXIT_ROLE = 1, 2, 3, 4
 OURS, CHOOSE = "Configuration", "Which run"
 PresetOption = Annotated[
     str | None,

@@ -22,7 +22,7 @@ from services.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from services.monitor.operator import RobotOrder
+    from services.monitor.halting import RobotOrder
 
 
 def add_to(app: typer.Typer) -> None:

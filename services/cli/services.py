@@ -57,18 +57,20 @@ def _add_service(app: typer.Typer, process: Process) -> None:
 
 def serve(process: Process, config: Config, folder: Path) -> int:
     """Run one service until it stops; returns its exit code."""
-    from shared import run_record
-    from shared.service import guarded, setup_logging, starting
+    from shared import roles, run_record
+    from shared.service import guarded, new_life, setup_logging, starting
     from shared.settings import claim
 
-    run_record.begin(folder, claim(folder, config))
-    setup_logging(process.name, folder)
+    life = new_life()
 
     def run() -> None:
         with starting():
-            import_installed(process.module, process.extras[0]).run(config, folder)
+            import_installed(process.module, process.extras[0]).run(config, folder, life)
 
-    return guarded(process.name, run)
+    with roles.locked(folder, process.name, process.ident(config.robot.id), life):
+        run_record.begin(folder, claim(folder, config))
+        setup_logging(process.name, folder)
+        return guarded(process.name, run)
 
 
 def router(

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from services.processes import ACTOR, DRIVER, MAIN
+from shared import roles
 from shared.bus import Bus
 from shared.config import Config
 from shared.errors import ConfigError, PeerMissing, RobotTaken
@@ -119,7 +120,7 @@ def commanding(config: Config, robot: str | None) -> Iterator[Commander]:
         ConfigError: `robot` is not a name, was left out though there are several, or its driver
             speaks another protocol.
         PeerMissing: There is no robot.
-        RobotTaken: Somebody else commands it.
+        RobotTaken, RoleTaken: Somebody else commands it.
         RouterMissing: There is no router.
     """
     stop = StopFlag()
@@ -131,7 +132,8 @@ def commanding(config: Config, robot: str | None) -> Iterator[Commander]:
         refuse_others(peers, robot, life)
         me = Service(ACTOR.name, robot, life, config, bus, stop)
         # Whatever the robot is configured to do is right for who only answers it.
-        bus.announce(ACTOR.name, robot, life, PROTOCOL_VERSION, fingerprint)
+        with roles.claimed(bus, ACTOR.name, robot, life):
+            bus.announce(ACTOR.name, robot, life, PROTOCOL_VERSION, fingerprint)
         with controlled(me):
             commander = Commander(me, robot)
             try:

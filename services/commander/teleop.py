@@ -17,16 +17,17 @@ from contextlib import contextmanager, suppress
 
 from services.commander.commander import Commander, commanding
 from services.commander.keyboard import KeyParser, Wish
+from services.monitor.halting import halt
 from shared.config import Config
-from shared.errors import BadMessage, BusError, ConfigError
-from shared.keys import ROBOT_COMMAND
-from shared.messages import Motion, Observation, RobotCommand, RobotState
+from shared.errors import ConfigError, PeerMissing
+from shared.messages import Motion, Observation
 
 POLL_S = 0.02
 """How often keys and observations are looked at."""
 PACE = 0.9
 """Least time between two answers, in periods: in lockstep, time itself waits for answers."""
-ESTOP_ATTEMPTS, ESTOP_S = 3, 1.0
+ESTOP_S = 3.0
+"""The driver is told of an emergency stop again and again for so long."""
 READ_BYTES = 256
 HELP = (
     "w/s or up/down: forward/back   a/d or left/right: turn   space: stop   "
@@ -131,19 +132,9 @@ class Teleop:
 
     def _estop(self) -> None:
         """Tell the driver to stop and stay stopped; meanwhile it hears nothing, and stops, too."""
-        robot, complaint = self._commander.robot, ""
-        for _ in range(ESTOP_ATTEMPTS):
-            try:
-                state = self._commander.bus.request(
-                    ROBOT_COMMAND,
-                    RobotCommand(command="estop"),
-                    RobotState,
-                    ident=robot,
-                    timeout_s=ESTOP_S,
-                ).state
-            except (BusError, BadMessage) as error:
-                complaint = str(error)
-                continue
-            self._echo(f"{robot}: {state}; corridor clear releases it")
-            return
-        self._echo(f"{robot}: no answer to the emergency stop, press e again: {complaint}")
+        robot, until_s = self._commander.robot, time.monotonic() + ESTOP_S
+        stands, bus = False, self._commander.bus
+        with suppress(PeerMissing):
+            stands = halt(bus, "estop", robot, self._echo, ended=lambda: time.monotonic() > until_s)
+        what = "corridor clear releases it" if stands else "no answer, press e again"
+        self._echo(f"{robot}: emergency stop: {what}")

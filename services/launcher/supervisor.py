@@ -1,8 +1,8 @@
 """Child processes: start them, restart what crashes, end them all in order.
 
-A child that exits with 0 was asked to stop and stays stopped. Exit codes 2 and 3 (wrong
-configuration, bad state) would come again: they end everything, with the child's own line. Any
-other end is a crash and is answered by a restart, later each time it happens again.
+A child that exits with 0 was asked to stop and stays stopped. Exit codes 2, 3 and 4 (wrong
+configuration, bad state, role taken) would come again: they end everything, with the child's own
+line. Any other end is a crash and is answered by a restart, later each time it happens again.
 
 Children run in sessions of their own, so that Ctrl-C reaches only us, and are tethered
 (`services.launcher.tether`): when this process is killed, they end by themselves.
@@ -29,7 +29,7 @@ STAGE_ENDS_S = (0.8, 1.6, 3.4, 3.9)
 FIRST_DELAY_S, LONGEST_DELAY_S = 0.25, 10.0
 STEADY_S = 30.0
 """A child that ran this long is restarted at once when it crashes."""
-FINAL_CODES = (2, 3)
+FINAL_CODES = (2, 3, 4)
 TAIL_BYTES = 16 * 1024
 """As much of the output of an ended child is looked at."""
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from services.learner import checkpoint
 from services.learner.mirror import Mirror
+from services.processes import MAIN
 from shared.config import Config
 from shared.errors import StateError
 from shared.inbox import Inbox
@@ -27,9 +28,9 @@ from shared.weights import parts
 Activity = Literal["waiting", "synchronising", "training", "fitting", "checkpoint"]
 
 
-def run(config: Config, folder: Path) -> None:
+def run(config: Config, folder: Path, life: str) -> None:
     """Train until stopped; work interrupted by a stop is done again from the checkpoint."""
-    with service("learner", "main", config) as me:
+    with service("learner", MAIN, config, life=life, halts=folder) as me:
         LearnerLoop(me, folder).run()
 
 

@@ -20,8 +20,8 @@ from shared import settings
 from shared.bus import Bus
 from shared.config import Config
 from shared.errors import BadMessage, BusError, ConfigError
-from shared.keys import SERVICE
-from shared.messages import ServiceCommand, ServiceReply
+from shared.keys import PING
+from shared.messages import Ping, ServiceReply
 
 PERIODS = 3
 """Heartbeat periods after which silence counts as sick."""
@@ -57,7 +57,7 @@ def _doing(bus: Bus, name: str, config: Config) -> str:
     ident = BY_NAME[name].ident(config.robot.id)
     inbox = bus.inbox()
     reader = Reader(inbox)
-    bus.request(SERVICE, ServiceCommand(command="ping"), ServiceReply, ident=f"{name}-{ident}")
+    bus.request(PING, Ping(), ServiceReply, ident=f"{name}-{ident}")
     deadline_s = time.monotonic() + PERIODS * config.bus.heartbeat_s
     while time.monotonic() < deadline_s:
         inbox.wait(0.1)

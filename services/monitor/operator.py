@@ -2,32 +2,34 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
-from collections.abc import Callable, Sequence
-from typing import Any, Literal, TypeVar
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, TypeVar
 
 import typer
 from pydantic import ValidationError
 
+from services.monitor.halting import RobotOrder, order
 from services.processes import DRIVER, SERVICES
 from shared.bus import Bus
 from shared.codec import first_problem
 from shared.config import Config
 from shared.errors import BadMessage, BusError, ConfigError, PeerMissing
 from shared.facts import NAME
-from shared.keys import ROBOT_COMMAND, ROBOT_WORLD, SERVICE, Peer, Stream
+from shared.halts import ALL
+from shared.keys import ROBOT_WORLD, STOP, Peer, Stream
 from shared.messages import (
     Message,
-    RobotCommand,
-    RobotState,
-    ServiceCommand,
     ServiceReply,
+    StopService,
     WorldChange,
     WorldChanged,
 )
 from shared.service import new_life
 
-RobotOrder = Literal["estop", "clear", "pause", "resume"]
 M = TypeVar("M", bound=Message)
 
 STOP_ORDER = [process.name for process in reversed(SERVICES)]
@@ -36,8 +38,10 @@ ATTEMPTS, ATTEMPT_S = 3, 1.0
 GONE_WITHIN_S = 10.0
 
 
-def command_robots(config: Config, command: RobotOrder, robot: str | None) -> int:
-    """Send a command to one robot or all of the run; print the state each acknowledges.
+def command_robots(config: Config, name: RobotOrder, robot: str | None) -> int:
+    """Halt one robot or all of the run, or release them; print what each answers.
+
+    A halt goes on until all stand, or until Ctrl-C.
 
     Returns:
         0, or 1 if a robot did not answer.
@@ -47,13 +51,27 @@ def command_robots(config: Config, command: RobotOrder, robot: str | None) -> in
         PeerMissing: there is no robot.
         RouterMissing: there is no router.
     """
-    message = RobotCommand(command=command)
+    _check_name(robot)
+    with Bus(config.bus, config.run.name) as bus, interruptible() as ended:
+        return 0 if order(bus, name, robot or ALL, typer.echo, ended=ended.is_set) else 1
 
-    def tell(bus: Bus, name: str) -> bool:
-        typer.echo(f"{name}: {_ask(bus, ROBOT_COMMAND, message, RobotState, name).state}")
-        return True
 
-    return _tell_robots(config, repr(command), robot, tell)
+@contextmanager
+def interruptible() -> Iterator[threading.Event]:
+    """An event that Ctrl-C and SIGTERM set while the block runs."""
+    ended = threading.Event()
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, lambda *_: ended.set()) for number in numbers}
+    try:
+        yield ended
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _check_name(robot: str | None) -> None:
+    if robot is not None and not NAME.match(robot):
+        raise ConfigError(f"--robot: expected a name like {NAME.pattern}, got {robot!r}")
 
 
 def change_world(config: Config, robot: str | None, **change: Any) -> int:
@@ -93,10 +111,9 @@ def _tell_robots(
     config: Config, what: str, robot: str | None, tell: Callable[[Bus, str], bool]
 ) -> int:
     """Tell one robot or all of the run something; 1 if `tell` was not obeyed or not answered."""
-    if robot is not None and not NAME.match(robot):
-        raise ConfigError(f"--robot: expected a name like {NAME.pattern}, got {robot!r}")
+    _check_name(robot)
     with Bus(config.bus, config.run.name) as bus:
-        present = [peer.id for peer in bus.peers() if peer.service == DRIVER.name]
+        present = sorted({peer.id for peer in bus.peers(DRIVER.name)})
         names = [robot] if robot is not None else present
         if not names:
             raise PeerMissing(
@@ -126,7 +143,6 @@ def stop_services(config: Config, services: Sequence[str]) -> int:
         PeerMissing: nobody to stop.
         RouterMissing: there is no router.
     """
-    message = ServiceCommand(command="stop")
     with Bus(config.bus, config.run.name) as bus:
         peers = [p for p in bus.peers() if not services or p.service in services]
         if not peers:
@@ -134,7 +150,7 @@ def stop_services(config: Config, services: Sequence[str]) -> int:
             raise PeerMissing(f"no {wanted} of run {config.run.name!r} at {config.bus.endpoint}")
         for peer in sorted(peers, key=_stop_place):
             try:
-                _ask(bus, SERVICE, message, ServiceReply, f"{peer.service}-{peer.id}")
+                _ask(bus, STOP, StopService(), ServiceReply, f"{peer.service}-{peer.id}")
             except (BusError, BadMessage) as error:
                 typer.echo(f"{peer.service} {peer.id}: no answer: {error}", err=True)
         left = _wait_gone(bus, peers)

@@ -25,8 +25,8 @@ from services.processes import ACTOR, DRIVER, LEARNER, REPLAY
 from shared.bus import Bus
 from shared.config import Config
 from shared.errors import BadMessage, BusError
-from shared.keys import SERVICE, Peer
-from shared.messages import ServiceCommand, ServiceReply
+from shared.keys import PING, Peer
+from shared.messages import Ping, ServiceReply
 
 PING_S = 1.0
 HEARTBEATS = 2.5
@@ -166,9 +166,8 @@ def _facts(snapshot: Snapshot) -> list[tuple[str, str]]:
 
 def _ping(bus: Bus, peer: Peer) -> ServiceReply | None:
     ident = f"{peer.service}-{peer.id}"
-    message = ServiceCommand(command="ping")
     try:
-        return bus.request(SERVICE, message, ServiceReply, ident=ident, timeout_s=PING_S)
+        return bus.request(PING, Ping(), ServiceReply, ident=ident, timeout_s=PING_S)
     except (BusError, BadMessage, ValueError):  # an id from outside may be too long for a key
         return None
 

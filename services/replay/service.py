@@ -11,6 +11,7 @@ import threading
 import time
 from pathlib import Path
 
+from services.processes import MAIN
 from services.replay.footprint import gather_heap
 from services.replay.numbering import Counters, filling, progress_of
 from services.replay.storage import Storage
@@ -43,13 +44,13 @@ from shared.rl.draws import generator
 from shared.service import TICK_S, Service, Stopped, service
 
 
-def run(config: Config, folder: Path) -> None:
+def run(config: Config, folder: Path, life: str) -> None:
     """Keep the replay memory until stopped."""
     gather_heap()
     identity = f"{config.run.name}/{config.run.seed}"
     storage = Storage(folder / "replay", config.memory, identity)
     try:
-        with service("replay", "main", config) as me:
+        with service("replay", MAIN, config, life=life, halts=folder) as me:
             Intake(me, storage, folder).run()
     finally:
         storage.close()
@@ -73,8 +74,9 @@ class Intake:
 
     def run(self) -> None:
         """Serve until stopped. Raises what ended one of the other threads, if something did."""
-        for stream in (EPISODE, PROGRESS, TURNS):
-            self._inbox.serve(stream)
+        for stream in (EPISODE, PROGRESS):
+            self._inbox.serve(stream, "*")
+        self._inbox.serve(TURNS)
         for stream in (CHANGES, SNAPSHOT, MINI_BATCH):
             self._bulk.serve(stream)
         bulk = threading.Thread(target=self._serve_bulk, name="bulk", daemon=True)

@@ -6,7 +6,8 @@ How it moves is decided in `motion_control.py`; sequence numbers, bumps and comm
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from collections.abc import Collection
+from typing import Any
 
 from services.robot_driver.host import Host
 from services.robot_driver.motion_control import MotionControl
@@ -15,9 +16,12 @@ from services.robot_driver.safety import Safety
 from services.robot_driver.world_changes import Outcome, WorldChanges, described
 from shared.config import Config
 from shared.messages import (
+    MAX_EARLIER,
     MAX_FAULTS,
     Action,
+    DriverState,
     Fault,
+    HaltKind,
     Interruption,
     Motion,
     Observation,
@@ -26,8 +30,6 @@ from shared.messages import (
     WorldChanged,
 )
 
-State = Literal["waiting", "driving", "recovering", "blocked", "paused", "estop", "stopped"]
-
 
 class Driver:
     """Executes actions one by one and tells what the robot perceives after each."""
@@ -35,9 +37,11 @@ class Driver:
     def __init__(self, config: Config, robot: Robot, life: str, host: Host | None = None) -> None:
         self._config, self._robot, self._host = config, robot, host or Host()
         self.life = life
+        self.earlier: tuple[str, ...] = ()
+        """Lives that this one continues after clean stops, newest first."""
         self.safety = Safety(config.robot)
         self._control = MotionControl(config, robot, self.safety, self._host)
-        self.state: State = "waiting"
+        self.state: DriverState = "waiting"
         self.sequence = 0
         self.attempt = 0
         self.bumps = self.recoveries = self.late_actions = self.refused_actions = 0
@@ -47,6 +51,10 @@ class Driver:
         self._changes = WorldChanges(robot.changeable)
         self._bump = False
         self._interruption: Interruption = ""
+        self._begun: tuple[int | None, str] = (None, "")
+        """The action in force, and the life of the actor that sent it."""
+        self._executed: tuple[int | None, str] = (None, "")
+        """The action that was executed last."""
         self._pose = Pose(0.0, 0.0, 0.0)
 
     @property
@@ -62,8 +70,11 @@ class Driver:
         return Observation(
             robot=self._config.robot.id,
             life=self.life,
+            earlier=self.earlier,
             sequence=self.sequence,
             attempt=self.attempt,
+            action=self._executed[0],
+            actor_life=self._executed[1],
             image=sensed.image.tobytes(),
             x_m=sensed.pose.x_m,
             y_m=sensed.pose.y_m,
@@ -88,13 +99,14 @@ class Driver:
             self.refused_actions += 1
         return fits
 
-    def execute(self, action: int) -> None:
+    def execute(self, action: int, actor_life: str = "") -> None:
         """Lockstep: drive one whole action; stop and recover at a bump (A9, E11)."""
-        self.start(action)
+        self.start(action, actor_life)
         self.settle(self.advance(self._config.robot.period_s))
 
-    def start(self, action: int) -> None:
-        """Begin to drive an action, within the limits."""
+    def start(self, action: int, actor_life: str = "") -> None:
+        """Begin to drive an action of an actor, within the limits."""
+        self._begun = (action, actor_life)
         self._control.start_action(action)
         self.state = "driving"
 
@@ -182,21 +194,20 @@ class Driver:
         """Stand still now; may be called in any state."""
         self._control.halt()
 
-    def command(self, command: Literal["estop", "clear", "pause", "resume"]) -> None:
-        """Carry out an operator's command. A latched e-stop yields to `clear` alone."""
-        if command == "estop":
-            self.safety.estop = True
-        elif command == "clear":
-            if self.safety.estop:
-                self.look_again("estop")
-            self.safety.estop = False
-        else:
-            realtime = self._config.robot.timing == "realtime"
-            if command == "resume" and self.safety.paused and realtime:
-                self.look_again("pause")
-            self.safety.paused = command == "pause"
-        if self.safety.halted:
+    def hold(self, kinds: Collection[HaltKind]) -> bool:
+        """Stand while halts of these kinds are in force; without any, go on and look anew.
+
+        Returns whether the robot has been told to stand and no action will move it.
+        """
+        safety, before = self.safety, (self.safety.estop, self.safety.paused)
+        safety.estop, safety.paused = "estop" in kinds, "pause" in kinds
+        if before[0] and not safety.estop:
+            self.look_again("estop")
+        if before[1] and not safety.paused and self._config.robot.timing == "realtime":
+            self.look_again("pause")
+        if safety.halted:
             self.halt()
+        return safety.halted
 
     def change(self, wish: WorldChange, *, at_once: bool = False) -> WorldChanged:
         """Take a wish to change the world: it waits for its episode, or is refused.
@@ -204,6 +215,8 @@ class Driver:
         With `at_once`, while the robot waits between actions, what need not wait is carried out now
         and not instead of the next action. A refusal is counted and told.
         """
+        if wish.kind in ("withdraw", "list"):
+            return self._rearrange(wish)
         if (known := self._changes.known(wish)) is not None:
             return known
         try:
@@ -227,16 +240,18 @@ class Driver:
             self._host.keep(self._changes.kept())
         return bool(outcomes)
 
-    def report(self, undecodable: int) -> RobotState:
+    @property
+    def shown_state(self) -> DriverState:
+        """What the robot does, for others: a halt outweighs the rest."""
+        return "estop" if self.safety.estop else "paused" if self.safety.paused else self.state
+
+    def report(self, undecodable: int, busy: int = 0) -> RobotState:
         """The heartbeat."""
         laps = self._robot.laps
-        halted: State | None = (
-            "estop" if self.safety.estop else "paused" if self.safety.paused else None
-        )
         return RobotState(
             robot=self._config.robot.id,
             life=self.life,
-            state=halted or self.state,
+            state=self.shown_state,
             sequence=self.sequence,
             x_m=self._pose.x_m,
             y_m=self._pose.y_m,
@@ -250,6 +265,7 @@ class Driver:
             refused_actions=self.refused_actions,
             resent_observations=self.resent_observations,
             undecodable=undecodable,
+            busy=busy,
             laps_left=laps.left,
             laps_right=laps.right,
             pending_changes=len(self._changes.pending),
@@ -262,19 +278,21 @@ class Driver:
     def saved(self) -> dict[str, Any]:
         """Everything a later process needs to continue exactly here, for msgpack."""
         names = (
-            "life sequence attempt bumps recoveries late_actions refused_actions "
-            "resent_observations refused_changes blocks _bump _interruption"
+            "sequence attempt bumps recoveries late_actions refused_actions "
+            "resent_observations refused_changes blocks _bump _interruption _executed"
         )
         return {
             "kind": self._config.robot.kind,
             "robot": self._robot.state(),
             "changes": self._changes.saved(),
-            "estop": self.safety.estop,
+            "lives": [self.life, *self.earlier],
             **{name: getattr(self, name) for name in names.split()},
         }
 
     def restore(self, saved: dict[str, Any]) -> None:
-        """Continue from `saved()`. Raises KeyError or ValueError when it does not fit.
+        """Continue, in a life of one's own, from `saved()`.
+
+        Raises KeyError, TypeError or ValueError when it does not fit.
 
         A real robot was not held still meanwhile: what it perceives next tells of a restart.
         """
@@ -283,8 +301,8 @@ class Driver:
             raise KeyError(f"missing or unknown: {', '.join(odd)}")
         self._changes.restore(saved["changes"])
         self._robot.restore(saved["robot"])
-        self.safety.estop = bool(saved["estop"])
-        for name in saved.keys() - {"kind", "robot", "changes", "estop"}:
+        self.earlier = tuple(map(str, saved["lives"]))[:MAX_EARLIER]
+        for name in saved.keys() - {"kind", "robot", "changes", "lives"}:
             setattr(self, name, type(getattr(self, name))(saved[name]))
         if self._config.robot.kind != "sim":
             self.look_again("restart")
@@ -295,6 +313,17 @@ class Driver:
         Raises KeyError, TypeError or ValueError when it does not fit.
         """
         self._changes.restore_kept(kept)
+
+    def _rearrange(self, wish: WorldChange) -> WorldChanged:
+        """Tell what waits, or withdraw some of it."""
+        if wish.kind == "withdraw":
+            try:
+                self._changes.withdraw(wish.id)
+            except ValueError as error:
+                self._refused(wish, str(error))
+                return self._changes.answer(wish, str(error))
+            self._host.keep(self._changes.kept())
+        return self._changes.answer(wish, "")
 
     def _carry_out(self, episode: int) -> list[Outcome]:
         """Carry out what is due; the robot then stands still and looks again."""
@@ -322,6 +351,7 @@ class Driver:
     def _count(self, *, executed: bool) -> None:
         """Number the next observation: an executed action counts, anything else is a new look."""
         if executed:
+            self._executed = self._begun
             self.sequence, self.attempt = self.sequence + 1, 0
         else:
             self.attempt += 1

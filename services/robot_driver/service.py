@@ -15,21 +15,24 @@ from services.robot_driver.robot import NotReady
 from shared import statefile
 from shared.config import Config
 from shared.errors import StateError
+from shared.halt_keeper import KeptBook, clock_s
 from shared.inbox import Inbox
-from shared.keys import ACTION, OBSERVATION, ROBOT_COMMAND, ROBOT_STATE, ROBOT_WORLD
-from shared.messages import Action, Observation, RobotCommand, WorldChange
-from shared.service import TICK_S, Service, Stopped, new_life, service
+from shared.keys import ACTION, HALT, OBSERVATION, RELEASE, ROBOT_STATE, ROBOT_WORLD
+from shared.messages import Action, Halts, Observation, Release, Standing, WorldChange
+from shared.service import TICK_S, Service, Stopped, service
 
 STATE, WORLD = "state.msgpack", "world.msgpack"
 """Files of a robot: all of a driver that was stopped; its world, also of one that was killed."""
+LEARN_S = 1.0
+"""Longest that a driver asks for halts in force before its first motion."""
 
 
-def run(config: Config, folder: Path) -> None:
+def run(config: Config, folder: Path, life: str) -> None:
     """Drive one robot until stopped; a clean stop saves where it is."""
     own = folder / "robot" / config.robot.id
     robot = make_robot(config)
     host = ServiceHost(own / WORLD)
-    driver = Driver(config, robot, new_life(), host)
+    driver = Driver(config, robot, life, host)
     try:
         _restore(driver, own, config.robot.kind)
         # Stopped before it was up, it has driven nothing, but has taken up what was saved.
@@ -51,11 +54,9 @@ def _restore(driver: Driver, own: Path, kind: str) -> None:
     """Continue after a clean stop; after a kill begin anew, but in the world as it was."""
     path = own / STATE
     try:
-        if (saved := statefile.take(path)) is not None:
-            if saved["kind"] == kind:
-                driver.restore(saved)
-                return
-            driver.safety.estop = bool(saved["estop"])  # the rest is another robot's
+        if (saved := statefile.take(path)) is not None and saved["kind"] == kind:
+            driver.restore(saved)
+            return
         path = own / WORLD
         if kind == "sim" and (kept := statefile.read(path)) is not None:
             driver.restore_kept(kept)
@@ -101,17 +102,18 @@ class DriverLoop:
         self.me, self._driver, self._config = me, driver, me.config
         self._robot = me.config.robot.id
         self._inbox: Inbox = me.bus.inbox()
-        self._inbox.subscribe(ACTION, self._robot)
-        self._inbox.serve(ROBOT_COMMAND, self._robot)
+        self._inbox.serve(HALT)  # first, so that a stop waits behind nothing
+        self._inbox.serve(RELEASE)
         self._inbox.serve(ROBOT_WORLD, self._robot)
+        self._inbox.subscribe(ACTION, self._robot)
         me.stop.on_set(self._inbox.wake)
-        self._next_beat_s = 0.0
-        self._estop_mark = folder / "robot" / self._robot / "estop"
-        driver.safety.estop |= self._estop_mark.exists()
+        self._next_beat_s, self._heard_s = 0.0, clock_s()
+        self._halts = KeptBook(folder, me.name, me.ident, me.life, self._robot)
         host.attach(self)
 
     def run(self) -> None:
         """Turn after turn until the service is to stop."""
+        self._learn_of_halts()
         lockstep = self._config.robot.timing == "lockstep"
         turn = self._lockstep_turn if lockstep else self._realtime_turn
         while not self.me.stop.is_set():
@@ -121,14 +123,13 @@ class DriverLoop:
         """Answer commands; publish the heartbeat when due."""
         for request in self._inbox.requests():
             with request:
-                if isinstance(request.message, RobotCommand):
-                    self._driver.command(request.message.command)
-                    self.me.log.info("operator: %s", request.message.command)
-                    if problem := self._remember_estop():
-                        request.refuse(problem)
-                    else:
-                        request.reply(self._driver.report(self._inbox.refused_total))
-                    force = True
+                if isinstance(request.message, Halts | Release):
+                    changed = self._halts.hear(request.message)
+                    stands = self._hold()
+                    request.reply(self._halts.standing(self._driver.shown_state, stands=stands))
+                    if changed:
+                        self.me.log.info("%s", request.message)
+                    force |= changed
                 elif isinstance(request.message, WorldChange):
                     between_actions = self._driver.state == "waiting"
                     request.reply(self._driver.change(request.message, at_once=between_actions))
@@ -136,28 +137,39 @@ class DriverLoop:
         now_s = time.monotonic()
         if force or now_s >= self._next_beat_s:
             self._next_beat_s = now_s + self._config.bus.heartbeat_s
-            report = self._driver.report(self._inbox.refused_total)
+            report = self._driver.report(self._inbox.refused_total, self._inbox.busy_total)
             self.me.bus.publish(ROBOT_STATE, report, self._robot)
 
-    def _remember_estop(self) -> str:
-        """Keep the latch on disk before it is acknowledged: not even kill -9 releases it.
+    def _hold(self) -> bool:
+        """Stand if a halt holds the robot; whether it does."""
+        return self._driver.hold(self._halts.book.kinds(self._robot))
 
-        Returns why it could not be kept (a full disk); the robot stays stopped all the same, and a
-        latch that cannot be taken off the disk is not released.
+    def _learn_of_halts(self) -> None:
+        """Before the robot moves (again): stand if any service that is there knows of a halt."""
+        self._hold()
+        others = {peer.life for peer in self.me.bus.peers()} - {self.me.life}
+        until_s = time.monotonic() + LEARN_S
+        self._inbox.ask_all(HALT, Halts(), timeout_s=LEARN_S)
+        while others and (left_s := until_s - time.monotonic()) > 0 and not self.me.stop.is_set():
+            self._inbox.wait(left_s)
+            answers = self._inbox.answers(Standing)
+            others -= {answer.life for answer in answers}
+            if self._halts.join(answers):
+                self.me.log.info("a halt is in force: %s", self._halts.book.holding(self._robot))
+            self._hold()
+            self.beat()
+
+    def _taken(self, action: Action) -> bool:
+        """Whether this action answers the newest observation and may be carried out.
+
+        After a silence, in which driver or network may have been away, halts are asked for first.
         """
-        safety = self._driver.safety
-        try:
-            if safety.estop:
-                statefile.write_atomically(self._estop_mark, b"emergency stop: corridor clear\n")
-            elif self._estop_mark.exists():
-                self._estop_mark.unlink()
-        except OSError as error:
-            released, safety.estop = not safety.estop, True
-            self._driver.halt()
-            what = "not cleared" if released else "stopped, but a restart would release it"
-            self.me.log.error("emergency stop: %s: %s", what, error)
-            return f"{what}: {error}"
-        return ""
+        if not self._driver.answers(action):
+            return False
+        silent_s, self._heard_s = clock_s() - self._heard_s, clock_s()
+        if silent_s > self._config.bus.lease_ms / 1000:
+            self._learn_of_halts()
+        return not self._driver.safety.halted and self._driver.attempt == action.attempt
 
     # ------------------------------------------------------------ lockstep
 
@@ -172,7 +184,7 @@ class DriverLoop:
         elif action.action is None:
             self._driver.look_again("")
         else:
-            self._driver.execute(action.action)
+            self._driver.execute(action.action, action.actor_life)
 
     def _await_answer(self, observation: Observation) -> Action | None:
         """Publish, and publish again until answered. None when interrupted or stopped."""
@@ -188,7 +200,7 @@ class DriverLoop:
             self._inbox.wait(min(TICK_S, max(resend_s - now_s, 0.01)))
             self.beat()
             for _, action in self._inbox.take(ACTION, Action):
-                if driver.answers(action) and not driver.safety.halted:
+                if self._taken(action):
                     return action
         return None
 
@@ -233,7 +245,7 @@ class DriverLoop:
             if driver.attempt != attempt or driver.safety.halted:
                 break
             for _, action in self._inbox.take(ACTION, Action):
-                if started or hold or not driver.answers(action):
+                if started or hold or not self._taken(action):
                     continue
                 if driver.apply_due(action.episode):
                     return
@@ -245,7 +257,7 @@ class DriverLoop:
                     driver.halt()
                 else:
                     started = True
-                    driver.start(action.action)
+                    driver.start(action.action, action.actor_life)
             part_s = min(SLICE_S, left_s)
             bump = driver.advance(part_s)
             left_s -= part_s

@@ -27,7 +27,7 @@ from shared.errors import BadMessage
 from shared.messages import Box, WorldChange, WorldChanged
 
 MAX_PENDING = 64
-"""More changes than this do not wait; further ones are refused."""
+"""More changes than this do not wait for an episode; further ones are refused."""
 MAX_REMEMBERED = 64
 """Answers kept for wishes that are sent again because the answer was lost."""
 
@@ -77,10 +77,18 @@ class WorldChanges:
         """
         if self._robot is None:
             raise ValueError("the world of this robot cannot be changed")
-        if len(self._pending) >= MAX_PENDING:
+        waits = change.at_episode > 0
+        if sum((other.at_episode > 0) == waits for other in self._pending) >= MAX_PENDING:
             raise ValueError(f"{MAX_PENDING} changes wait already")
         self._check(change, self._robot)
         insort(self._pending, change, key=_episode)
+
+    def withdraw(self, ident: str) -> None:
+        """Forget a change that waits. Raises ValueError if there is none with this id."""
+        left = [change for change in self._pending if change.id != ident]
+        if len(left) == len(self._pending):
+            raise ValueError(f"no change with id {ident} waits")
+        self._pending = left
 
     def carry_out(self, episode: int) -> list[Outcome]:
         """Carry out, in order, what is due in this episode of the robot."""
@@ -89,7 +97,7 @@ class WorldChanges:
         return [Outcome(change, self._refusal(change)) for change in due]
 
     def answer(self, change: WorldChange, refusal: str) -> WorldChanged:
-        """The answer to a wish, remembered in case it is sent again."""
+        """The answer to a wish; to a change it is remembered in case that is sent again."""
         robot = self._robot
         answer = WorldChanged(
             accepted=not refusal,
@@ -97,8 +105,9 @@ class WorldChanges:
             world=robot.world.name if robot else "",
             obstacles=tuple(obstacle.name for obstacle in robot.obstacles) if robot else (),
             pending=len(self._pending),
+            waiting=tuple(self._pending) if change.kind in ("withdraw", "list") else (),
         )
-        if change.id:
+        if change.id and change.kind != "withdraw":
             self._answers[change.id] = answer
             if len(self._answers) > MAX_REMEMBERED:
                 self._answers.popitem(last=False)
@@ -188,6 +197,8 @@ def obstacle_of(box: Box) -> Obstacle:
 
 def described(change: WorldChange) -> str:
     """A change in a few words, for a log."""
+    if change.kind == "withdraw":
+        return f"withdraw the change {change.id}"
     if change.box is not None:
         return f"place obstacle {change.box.name!r} at ({change.box.x_m:g}, {change.box.y_m:g})"
     if change.name is not None:

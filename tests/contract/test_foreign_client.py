@@ -26,7 +26,7 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
 
 
 def pack(name: str, **fields: Any) -> bytes:
-    return msgpack.packb({"v": 1, "t": name, **fields})
+    return msgpack.packb({"v": 2, "t": name, **fields})
 
 
 class Client:
@@ -62,10 +62,23 @@ class Client:
                 return answers
         raise AssertionError(f"nobody answers {key}")
 
-    def refusals(self, key: str, payload: bytes) -> list[str]:
+    def ask_all(self, key: str, payload: bytes) -> dict[str, dict[str, Any]]:
+        """The answers of all lives, by service and id."""
+        replies = self.session.get(
+            f"{self.run}/{key}",
+            zenoh.handlers.FifoChannel(64),
+            payload=payload,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=10.0,
+        )
+        answers = [msgpack.unpackb(r.ok.payload.to_bytes()) for r in replies if r.ok]
+        return {f"{answer['service']}-{answer['id']}": answer for answer in answers}
+
+    def refusals(self, key: str, payload: bytes) -> list[dict[str, Any]]:
         """Error replies to one request."""
         replies = self.session.get(f"{self.run}/{key}", payload=payload, timeout=10.0)
-        return [r.err.payload.to_string() for r in replies if r.err]
+        return [msgpack.unpackb(r.err.payload.to_bytes()) for r in replies if r.err]
 
 
 @pytest.fixture
@@ -103,6 +116,8 @@ def test_foreign_actor_drives_our_robot_for_50_actions(cluster: Cluster, client:
         assert len(seen["image"]) == 50 * 75
         bumps += seen["bump"]
         places.append((seen["x_m"], seen["y_m"]))
+        told = (None, "") if sequence == 0 else ((sequence - 1) % 3, LIFE)
+        assert (seen["action"], seen["actor_life"]) == told
         client.session.put(
             f"{client.run}/actor/robotino1/action",
             pack(
@@ -120,9 +135,20 @@ def test_foreign_actor_drives_our_robot_for_50_actions(cluster: Cluster, client:
             congestion_control=zenoh.CongestionControl.BLOCK,
         )
     assert len(set(places)) > 40
-    state = client.ask("robot/robotino1/command", pack("RobotCommand", command="estop"))[0]
-    assert (state["t"], state["state"]) == ("RobotState", "estop")
-    assert state["bumps"] >= bumps
+    assert bumps
+    halt = {"number": time.time_ns(), "kind": "estop", "robot": ""}
+    told = client.ask_all("halt", pack("Halts", halts=[halt]))["driver-robotino1"]
+    assert (told["t"], told["state"], told["stands"]) == ("Standing", "estop", True)
+    assert told["halts"] == [halt]
+    deadline = {"life": told["life"], "until_s": told["clock_s"] + 2.0}
+    release = {"numbers": [halt["number"]], "robot": ""}
+    late = {**deadline, "until_s": told["clock_s"] - 1.0}
+    for deadlines, stands in (([], True), ([late], True), ([deadline], False)):
+        answer = client.ask_all("release", pack("Release", **release, deadlines=deadlines))
+        assert answer["driver-robotino1"]["stands"] == stands
+    # A copy of the halt that comes late holds nobody again.
+    told = client.ask_all("halt", pack("Halts", halts=[halt]))["driver-robotino1"]
+    assert (told["stands"], told["halts"]) == (False, [])
 
 
 def test_foreign_client_changes_the_world_of_our_robot(cluster: Cluster, client: Client) -> None:
@@ -156,9 +182,18 @@ def test_foreign_client_changes_the_world_of_our_robot(cluster: Cluster, client:
         assert reason in refused["reason"]
     for fields in ({"kind": "switch"}, {"kind": "place", "box": {"name": "b3"}}, {"kind": "burn"}):
         (error,) = client.refusals(key, pack("WorldChange", **fields))
-        assert error.startswith("bad message: ")
+        assert (error["t"], error["final"]) == ("Refusal", True)
+        assert error["reason"].startswith("bad message: ")
+    # Wildcards are refused: answers to them could not be told apart.
+    (error,) = client.refusals("robot/*/world", pack("WorldChange", kind="list"))
+    assert (error["final"], "concrete key" in error["reason"]) == (True, True)
     # At an episode: instead of the first action that tells it.
-    assert change(kind="switch", world="minus", at_episode=2)["pending"] == 1
+    change(kind="switch", world="i16c", at_episode=1, id="00000000000c")
+    assert change(kind="switch", world="minus", at_episode=2)["pending"] == 2
+    assert [c["world"] for c in change(kind="list")["waiting"]] == ["i16c", "minus"]
+    left = change(kind="withdraw", id="00000000000c")
+    assert (left["accepted"], [c["world"] for c in left["waiting"]]) == (True, ["minus"])
+    assert change(kind="withdraw", id="00000000000c")["accepted"] is False
     attempt = wait_for(observations, sequence=0, world="plus")["attempt"]
     for sequence, episode in ((0, 0), (1, 1), (2, 2)):
         client.session.put(
@@ -181,15 +216,17 @@ def test_foreign_client_changes_the_world_of_our_robot(cluster: Cluster, client:
         wait_for(observations, sequence=min(sequence + 1, 2), attempt=int(episode == 2))
     seen = wait_for(observations, sequence=2, attempt=1)
     assert (seen["world"], seen["interruption"]) == ("minus", "world")
-    state = client.ask("robot/robotino1/command", pack("RobotCommand", command="pause"))[0]
-    assert (state["world"], state["pending_changes"], state["refused_changes"]) == ("minus", 0, 4)
+    states = client.subscribe("robot/robotino1/state")
+    state = wait_for(states, world="minus")
+    assert (state["pending_changes"], state["refused_changes"]) == (0, 5)
 
 
 def test_foreign_driver_is_driven_for_50_actions(cluster: Cluster, client: Client) -> None:
     actions = client.subscribe("actor/cube/action")
     cluster.start("replay", "learner", "actor")
-    x_m = 0.0
+    x_m, answer = 0.0, None
     for sequence in range(50):
+        led = {"action": answer["action"], "actor_life": answer["actor_life"]} if answer else {}
         observation = pack(
             "Observation",
             robot="cube",
@@ -203,6 +240,7 @@ def test_foreign_driver_is_driven_for_50_actions(cluster: Cluster, client: Clien
             world="garden",
             period_s=0.25,
             stamp_s=0.25 * sequence,
+            **led,
         )
         answer = None
         while answer is None:  # lockstep: sent again until answered
@@ -217,7 +255,7 @@ def test_foreign_driver_is_driven_for_50_actions(cluster: Cluster, client: Clien
         assert answer["robot_life"] == LIFE
         assert answer["action"] in (0, 1, 2)
         x_m += 0.15
-    progress = client.ask("replay/main/progress", pack("ProgressRequest", robot="cube"))[0]
+    progress = client.ask("replay/main/progress/cube", pack("ProgressRequest", robot="cube"))[0]
     assert progress["robot_fills"] >= 4
     assert progress["robot_life"] == LIFE
 
@@ -254,27 +292,27 @@ def test_foreign_episode_is_acknowledged_once_however_often_sent(
     cluster: Cluster, client: Client
 ) -> None:
     cluster.start("replay")
-    first = client.ask("replay/main/episode", episode(0))[0]
+    first = client.ask("replay/main/episode/cube", episode(0))[0]
     assert (first["t"], first["accepted"], first["duplicate"]) == ("EpisodeAck", True, False)
-    again = client.ask("replay/main/episode", episode(0))[0]
+    again = client.ask("replay/main/episode/cube", episode(0))[0]
     assert (again["accepted"], again["duplicate"], again["commit"]) == (True, True, first["commit"])
-    second = client.ask("replay/main/episode", episode(1))[0]
+    second = client.ask("replay/main/episode/cube", episode(1))[0]
     assert second["commit"] == first["commit"] + 1
-    early = client.ask("replay/main/episode", episode(2, fill=False))[0]
+    early = client.ask("replay/main/episode/cube", episode(2, fill=False))[0]
     assert early["accepted"] is False
     assert "being filled" in early["reason"]
-    assert client.refusals("replay/main/episode", episode(3, version=99))
+    assert client.refusals("replay/main/episode/cube", episode(3, version=99))
     cluster.kill("replay")
     cluster.start("replay")
-    after = client.ask("replay/main/episode", episode(1))[0]
+    after = client.ask("replay/main/episode/cube", episode(1))[0]
     assert (after["duplicate"], after["commit"]) == (True, second["commit"])
 
 
 def test_foreign_learner_mirrors_the_memory_and_is_heard(cluster: Cluster, client: Client) -> None:
     cluster.start("replay")
     for number in range(135):
-        assert client.ask("replay/main/episode", episode(number))[0]["accepted"]
-    done = client.ask("replay/main/episode", episode(135, fill=False))[0]
+        assert client.ask("replay/main/episode/cube", episode(number))[0]["accepted"]
+    done = client.ask("replay/main/episode/cube", episode(135, fill=False))[0]
     assert done["episode"] == 1
     weights = b"\x02\x00\x00\x00\x00\x00\x00\x00{}"
     digest = hashlib.sha256(weights).hexdigest()[:16]

@@ -9,9 +9,10 @@ import pytest
 from cluster import ALL, Cluster, make_config
 
 from benchmarks.waiting import wait_until
+from services.monitor.halting import RobotOrder, order
 from services.replay.storage import Storage
-from shared.keys import ACTOR_STATE, OBSERVATION, ROBOT_COMMAND, ROBOT_STATE
-from shared.messages import ActorState, Observation, RobotCommand, RobotState
+from shared.keys import ACTOR_STATE, OBSERVATION, ROBOT_STATE
+from shared.messages import ActorState, Observation, RobotState
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
 REALTIME = {"timing": "realtime", "period_s": 0.1, "deadman_s": 0.2}
@@ -142,13 +143,17 @@ def test_estop_latches_until_cleared_and_the_run_goes_on(run_name: str, tmp_path
         cluster.start(*ALL)
         cluster.wait_episodes(2, 90)
 
-        def command(what: str) -> RobotState:
-            return cluster.bus.request(
-                ROBOT_COMMAND,
-                RobotCommand.model_validate({"command": what}),
-                RobotState,
-                ident="robotino1",
-            )
+        inbox = cluster.bus.inbox()
+        inbox.subscribe(ROBOT_STATE)
+
+        def command(name: RobotOrder) -> RobotState:
+            inbox.take(ROBOT_STATE, RobotState)
+            assert order(cluster.bus, name, "", lambda _: None)
+
+            def beat() -> RobotState | None:
+                return next((s for _, s in inbox.take(ROBOT_STATE, RobotState)), None)
+
+            return wait_until(beat, 10, "a heartbeat")  # type: ignore[return-value]
 
         stopped = command("estop")
         assert stopped.state == "estop"
@@ -163,8 +168,6 @@ def test_estop_latches_until_cleared_and_the_run_goes_on(run_name: str, tmp_path
         assert before is not None
         cluster.wait_episodes(before.episode + 3, 60)
         paused = command("pause")
-        inbox = cluster.bus.inbox()
-        inbox.subscribe(ROBOT_STATE)
         beats: list[RobotState] = []
 
         def enough() -> bool:

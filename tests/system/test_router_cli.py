@@ -17,8 +17,8 @@ from benchmarks.waiting import wait_until
 from shared.bus import Bus
 from shared.config import BusConfig
 from shared.errors import PeerMissing
-from shared.keys import ROBOT_COMMAND
-from shared.messages import RobotCommand, RobotState
+from shared.keys import ROBOT_WORLD
+from shared.messages import WorldChange, WorldChanged
 
 pytestmark = pytest.mark.system
 
@@ -70,20 +70,20 @@ def test_refuses_a_port_in_use_with_one_line() -> None:
 
 def test_routes_requests_between_clients(router: str, run_name: str) -> None:
     config = BusConfig(endpoint=router)
-    state = message(RobotState, robot="r1", state="estop")
+    told = message(WorldChanged, world="plus")
     with (
-        answering(config, run_name, ROBOT_COMMAND, "r1", lambda _: state),
+        answering(config, run_name, "r1", lambda _: told, ROBOT_WORLD),
         Bus(config, run_name) as client,
     ):
 
-        def ask() -> RobotState | None:
-            command = RobotCommand(command="estop")
+        def ask() -> WorldChanged | None:
+            question = WorldChange(kind="list")
             try:
-                return client.request(ROBOT_COMMAND, command, RobotState, ident="r1")
+                return client.request(ROBOT_WORLD, question, WorldChanged, ident="r1")
             except PeerMissing:  # the declaration travels: not visible yet
                 return None
 
-        assert wait_until(ask, 5, "an answer through the router") == state
+        assert wait_until(ask, 5, "an answer through the router") == told
 
 
 def test_status_without_a_router_is_one_line(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ class Question:
     """A request of so many bytes."""
 
     def __init__(self, size: int) -> None:
-        self.size, self.refused = size, ""
+        self.size, self.refused, self.final = size, "", False
 
     def __enter__(self) -> Question:
         return self
@@ -45,8 +45,8 @@ class Question:
     def __exit__(self, *error: object) -> None:
         pass
 
-    def refuse(self, reason: str) -> None:
-        self.refused = reason
+    def refuse(self, reason: str, *, final: bool = False) -> None:
+        self.refused, self.final = reason, final
 
 
 def test_requests_beyond_the_queue_are_answered_busy() -> None:
@@ -57,7 +57,8 @@ def test_requests_beyond_the_queue_are_answered_busy() -> None:
     for question in asked:
         wire.receive(question)
     assert [question.refused for question in asked] == [""] * PROGRESS.queue + ["busy"] * 2
-    assert inbox.refused == {PROGRESS.name: 2}
+    assert not any(question.final for question in asked)
+    assert (inbox.refused, inbox.busy) == ({}, {PROGRESS.name: 2})
 
 
 def test_requests_that_are_empty_or_too_large_are_refused_unread() -> None:
@@ -68,6 +69,7 @@ def test_requests_that_are_empty_or_too_large_are_refused_unread() -> None:
         question = Question(size)
         wire.receive(question)
         assert question.refused == f"expected 1..{PROGRESS.max_bytes} bytes of payload"
+        assert question.final
     assert inbox.refused == {PROGRESS.name: 2}
 
 
@@ -79,7 +81,7 @@ def test_senders_are_bounded_and_a_newer_message_takes_the_place_of_an_older() -
         for number in range(MAX_SENDERS + 1):
             wire.receive(f"robot{number}", b"")
     wire.receive(None, b"")
-    assert inbox.refused == {OBSERVATION.name: 3}
+    assert inbox.refused_total + inbox.busy_total == 3
     assert len(inbox._latest) == MAX_SENDERS
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any, get_args
 
 import pytest
 
-from shared.config import DRIVER_ONLY, Config, Section
+from shared.config import DRIVER_ONLY, BusConfig, Config, Section
 from shared.errors import ConfigError
 from shared.keys import Peer
 from shared.messages import PROTOCOL_VERSION
@@ -22,7 +23,14 @@ FINGERPRINT = Config().fingerprint()
 def meet(peer: Peer) -> list[tuple[Any, ...]]:
     """What a new actor announces beside this peer."""
     announced: list[tuple[Any, ...]] = []
-    bus: Any = SimpleNamespace(peers=lambda: [peer], announce=lambda *told: announced.append(told))
+    bus: Any = SimpleNamespace(
+        run="demo",
+        config=BusConfig(),
+        peers=lambda *role: [] if role else [peer],
+        claims=lambda *_: set(),
+        claiming=lambda *_: nullcontext(),
+        announce=lambda *told: announced.append(told),
+    )
     try:
         Service("actor", "main", LIFE, Config(), bus, StopFlag()).meet()
     except ConfigError:

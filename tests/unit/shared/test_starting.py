@@ -80,5 +80,6 @@ def test_a_driver_stopped_before_it_is_up_keeps_what_it_was_to_continue(
         yield
 
     monkeypatch.setattr(driver_service, "service", never_up)
-    driver_service.run(config, tmp_path)
-    assert statefile.read(path) == saved
+    driver_service.run(config, tmp_path, "b" * 12)
+    again = statefile.read(path)
+    assert again == {**saved, "lives": ["b" * 12, "a" * 12], "_executed": [2, ""]}

@@ -45,13 +45,18 @@ class Replay:
     def __init__(self, silences: int = 0) -> None:
         self.silences, self.let = silences, threading.Event()
 
-    def request(self, stream: Any, episode: Any, cls: Any) -> EpisodeAck:
+    def request(self, stream: Any, episode: Any, cls: Any, *, ident: str) -> EpisodeAck:
         if self.silences:
             self.silences -= 1
             raise PeerSilent("silent")
-        if episode == "held up":
+        if episode.robot == "held-up":
             assert self.let.wait(PATIENCE_S)
         return EpisodeAck(accepted=True)
+
+
+def of(robot: str) -> Any:
+    """An episode of a robot."""
+    return SimpleNamespace(robot=robot)
 
 
 def courier(replay: Replay, notify: Callable[[], None]) -> Courier:
@@ -68,7 +73,7 @@ def courier(replay: Replay, notify: Callable[[], None]) -> Courier:
 def test_an_episode_that_is_held_up_holds_up_no_other() -> None:
     replay, told = Replay(), threading.Semaphore(0)
     sender = courier(replay, told.release)
-    slow, quick = sender.send("held up"), sender.send("any")  # type: ignore[arg-type]
+    slow, quick = sender.send(of("held-up")), sender.send(of("any"))
     assert quick.result(PATIENCE_S).ack.accepted
     assert told.acquire(timeout=PATIENCE_S)
     assert not slow.done()
@@ -79,11 +84,11 @@ def test_an_episode_that_is_held_up_holds_up_no_other() -> None:
 
 def test_attempts_are_counted_and_failures_arrive() -> None:
     sender = courier(Replay(silences=2), lambda: None)
-    assert sender.send("any").result(PATIENCE_S).attempts == 3  # type: ignore[arg-type]
+    assert sender.send(of("any")).result(PATIENCE_S).attempts == 3
 
     def stopped(_: str, attempt: Callable[[], Any]) -> Any:
         raise RuntimeError("stopped")
 
     sender = Courier(SimpleNamespace(bus=None, insist=stopped), lambda: None)  # type: ignore[arg-type]
     with pytest.raises(RuntimeError, match="stopped"):
-        sender.send("any").result(PATIENCE_S)  # type: ignore[arg-type]
+        sender.send(of("any")).result(PATIENCE_S)

@@ -53,19 +53,23 @@ class Rig:
         me = SimpleNamespace(
             config=make_config(robot={"timing": timing}),
             bus=SimpleNamespace(publish=lambda _, action, __: self.published.append(action)),
-            insist=lambda *_: progress(0),
         )
         predictor = FakePredictor()
         targets = SimpleNamespace(none=FakePredictor(version=0), of=lambda *_: predictor)
-        weights = SimpleNamespace(newest=(1, b""))
-        courier = SimpleNamespace(send=lambda _: self.on_its_way)
+        weights = SimpleNamespace(newest=(1, b""), refused=0)
+        asked: Future[RobotProgress] = Future()
+        asked.set_result(progress(0))
+        courier = SimpleNamespace(send=lambda _: self.on_its_way, ask=lambda _: asked)
         newest = Newest(LEARNER)
         path = folder / "robot1.msgpack"
-        given: tuple[Any, ...] = (me, "robot1", path, newest, weights, targets, courier)
+        given: tuple[Any, ...] = (me, "robot1", path, newest, weights, targets, courier, set)
         self.session = Session(*given)
 
     def see(self, sequence: int, **given: Any) -> None:
         """Let an observation come, and answer it if it may be answered."""
+        if sequence:
+            done = next(a for a in self.published if a.sequence == sequence - 1)
+            given = {"action": done.action, "actor_life": done.actor_life, **given}
         self.session.offer(make_observation(sequence, **given))
         waiting = self.session.advance()
         if waiting is not None:

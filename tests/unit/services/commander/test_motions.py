@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from builders import make_observation
+from builders import command, make_observation
 from fakes import message
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -129,7 +129,7 @@ def test_no_motion_begins_while_the_bumper_is_pressed() -> None:
 
 def test_a_stopped_robot_makes_no_motion() -> None:
     driver, robot = make()
-    driver.command("estop")
+    command(driver, "estop")
     start = robot.sim.pose
     driver.move("forward")
     assert robot.sim.pose == start

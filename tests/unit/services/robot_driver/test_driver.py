@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Any
 
 import msgpack
 import numpy as np
 import pytest
+from builders import command
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -266,16 +267,15 @@ def test_lockstep_actions_never_meet_the_deadman() -> None:
 def test_an_emergency_stop_is_latched_until_cleared() -> None:
     driver, robot = make_driver(timing="realtime")
     driver.start(0)
-    driver.command("estop")
+    command(driver, "estop")
     assert robot.velocity == STANDSTILL
     assert driver.report(0).state == "estop"
-    orders: tuple[Literal["pause", "resume", "estop"], ...] = ("resume", "pause", "resume", "estop")
-    for command in orders:
-        driver.command(command)
+    for order in ("resume", "pause", "resume", "estop"):
+        command(driver, order)
         driver.start(0)
         assert robot.velocity == STANDSTILL
         assert driver.safety.estop
-    driver.command("clear")
+    command(driver, "clear")
     assert not driver.safety.halted
     driver.start(0)
     assert robot.velocity.moving
@@ -284,8 +284,8 @@ def test_an_emergency_stop_is_latched_until_cleared() -> None:
 def test_the_observation_after_a_cleared_stop_tells_of_it_once() -> None:
     driver, _ = make_driver()
     driver.execute(0)
-    driver.command("estop")
-    driver.command("clear")
+    command(driver, "estop")
+    command(driver, "clear")
     observation = driver.observe()
     assert (observation.sequence, observation.attempt, observation.interruption) == (1, 1, "estop")
     driver.execute(0)
@@ -294,7 +294,7 @@ def test_the_observation_after_a_cleared_stop_tells_of_it_once() -> None:
 
 def test_clear_without_a_stop_changes_nothing() -> None:
     driver, _ = make_driver()
-    driver.command("clear")
+    command(driver, "clear")
     assert (driver.attempt, driver.observe().interruption) == (0, "")
 
 
@@ -302,20 +302,20 @@ def test_clear_without_a_stop_changes_nothing() -> None:
 def test_a_pause_interrupts_only_where_time_goes_on(timing: str, told: str) -> None:
     driver, robot = make_driver(timing=timing)
     driver.start(0)
-    driver.command("pause")
+    command(driver, "pause")
     assert robot.velocity == STANDSTILL
     assert driver.report(0).state == "paused"
-    driver.command("resume")
+    command(driver, "resume")
     assert driver.observe().interruption == told
-    driver.command("resume")  # a second one changes nothing
+    command(driver, "resume")  # a second one changes nothing
     assert driver.attempt == int(timing == "realtime")
 
 
 def test_clear_does_not_end_a_pause() -> None:
     driver, robot = make_driver()
-    driver.command("pause")
-    driver.command("estop")
-    driver.command("clear")
+    command(driver, "pause")
+    command(driver, "estop")
+    command(driver, "clear")
     driver.start(0)
     assert robot.velocity == STANDSTILL
 
@@ -335,8 +335,8 @@ def test_an_emergency_stop_after_a_bump_hides_no_bump() -> None:
     robot.contacts = [True]
     driver.start(0)
     driver.settle(driver.advance(0.02))
-    for command in ("estop", "clear"):
-        driver.command(command)  # type: ignore[arg-type]
+    for order in ("estop", "clear"):
+        command(driver, order)
     seen = driver.observe()
     assert (seen.sequence, seen.bump, seen.interruption) == (1, True, "estop")
 
@@ -376,6 +376,8 @@ def test_a_restored_driver_continues_where_the_saved_one_stood() -> None:
             driver, robot = make_driver()
             driver.life = "d" * 12
             driver.restore(saved)
+            assert driver.observe().earlier == (LIFE,)
+            driver.earlier, driver.life = (), LIFE
         for action in (0, 2):
             observations.append(driver.observe())
             driver.execute(action)
@@ -384,17 +386,17 @@ def test_a_restored_driver_continues_where_the_saved_one_stood() -> None:
     assert observations[:3] == observations[3:]
 
 
-def test_a_saved_emergency_stop_stays_latched() -> None:
-    driver, robot = make_driver()
-    driver.command("estop")
-    saved = driver.saved()
-    other, robot = make_driver()
-    other.restore(saved)
-    other.start(0)
-    assert robot.velocity == STANDSTILL
+def test_an_observation_tells_what_was_executed_and_who_sent_it() -> None:
+    driver, _ = make_driver(timing="realtime")
+    assert (driver.observe().action, driver.observe().actor_life) == (None, "")
+    driver.execute(2, "b" * 12)
+    driver.start(0, "c" * 12)
+    driver.look_again("late")  # it was stopped before it ended: it does not count
+    seen = driver.observe()
+    assert (seen.sequence, seen.action, seen.actor_life) == (1, 2, "b" * 12)
 
 
-@pytest.mark.parametrize("missing", ["robot", "changes", "estop"])
+@pytest.mark.parametrize("missing", ["robot", "changes", "lives"])
 def test_a_saved_state_without_its_parts_is_refused(missing: str) -> None:
     driver, _ = make_driver()
     saved = driver.saved()

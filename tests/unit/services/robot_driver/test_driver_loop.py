@@ -16,7 +16,6 @@ import pytest
 from fake_link import FakeLink, config_of
 
 from benchmarks.waiting import wait_until
-from services.robot_driver import service
 from services.robot_driver.driver import Driver
 from services.robot_driver.host import Host
 from services.robot_driver.motion_control import SLICE_S
@@ -25,9 +24,20 @@ from services.robot_driver.recovery import WatchedRobot, back_off
 from services.robot_driver.robot import STANDSTILL, Felt, Pose, Velocity
 from services.robot_driver.safety import Safety
 from services.robot_driver.service import DriverLoop, ServiceHost
+from shared import statefile
 from shared.config import Config
+from shared.halt_keeper import clock_s
+from shared.halts import new_halt
 from shared.keys import OBSERVATION, Stream
-from shared.messages import Action, Motion, Observation, RobotCommand
+from shared.messages import (
+    Action,
+    Deadline,
+    HaltKind,
+    Message,
+    Motion,
+    Observation,
+    Release,
+)
 from shared.service import StopFlag
 
 LIFE, ACTOR = "a" * 12, "b" * 12
@@ -45,8 +55,8 @@ CONFIG = config_of(
 class Request:
     """A command of an operator, and what was answered."""
 
-    def __init__(self, command: Any) -> None:
-        self.message = RobotCommand(command=command)
+    def __init__(self, message: Message) -> None:
+        self.message = message
         self.replies: list[Any] = []
         self.refusals: list[str] = []
         self.reply, self.refuse = self.replies.append, self.refusals.append
@@ -65,16 +75,21 @@ class FakeBus:
         self.observations: list[Observation] = []
         self.actions: list[Action] = []
         self.commands: list[Request] = []
-        self.refused_total = 0
+        self.refused_total = self.busy_total = 0
         self._woken = threading.Event()
 
     def inbox(self) -> FakeBus:
         return self
 
-    def subscribe(self, *_: object) -> None:
+    def subscribe(self, *_: object, **__: object) -> None:
         pass
 
-    serve = subscribe
+    serve = ask_all = subscribe
+
+    def answers(self, *_: object) -> list[Any]:
+        return []
+
+    peers = answers
 
     def wake(self) -> None:
         self._woken.set()
@@ -104,8 +119,16 @@ class Stand:
         self.robot = HardwareRobot(config.robot, self.link)
         self.driver = Driver(config, self.robot, LIFE, host)
         self.stop = StopFlag()
+        self.numbers: list[int] = []
+        self.kinds: list[HaltKind] = []
         me: Any = SimpleNamespace(
-            stop=self.stop, log=logging.getLogger("test"), bus=self.bus, config=config
+            stop=self.stop,
+            log=logging.getLogger("test"),
+            bus=self.bus,
+            config=config,
+            name="driver",
+            ident=config.robot.id,
+            life=LIFE,
         )
         self.loop = DriverLoop(me, self.driver, host, folder)
         self.thread = threading.Thread(target=self.loop.run)
@@ -138,11 +161,22 @@ class Stand:
         self.until(lambda: len(self.bus.observations) > number, "an observation")
         return self.bus.observations[number]
 
-    def ask(self, *commands: str) -> list[Request]:
-        requests = [Request(command) for command in commands]
+    def ask(self, *orders: str) -> list[Request]:
+        """Halt or release as an operator does, all at once."""
+        requests = [Request(self._message(order)) for order in orders]
         self.bus.commands = requests
         self.until(lambda: all(r.replies or r.refusals for r in requests), "answers")
         return requests
+
+    def _message(self, order: str) -> Message:
+        kind: HaltKind = "estop" if order in ("estop", "clear") else "pause"
+        if order in ("estop", "pause"):
+            self.numbers.append(len(self.numbers))
+            self.kinds.append(kind)
+            return new_halt(kind, "", self.numbers[-1])
+        numbers = tuple(n for n in self.numbers if self.kinds[n] == kind)
+        deadline = Deadline(life=LIFE, until_s=clock_s() + 1.0)
+        return Release(numbers=numbers or (999,), deadlines=(deadline,))
 
     def until(self, condition: Callable[[], Any], what: str) -> None:
         wait_until(condition, 20, what)
@@ -215,21 +249,47 @@ def test_an_emergency_stop_holds_where_it_cannot_be_written(
 
     with standing(tmp_path) as stand:
         with monkeypatch.context() as patch:
-            patch.setattr(service.statefile, "write_atomically", full)
+            patch.setattr(statefile, "write_atomically", full)
             (request,) = stand.ask("estop")
-        assert not request.replies
-        assert "stopped, but a restart would release it: [Errno 28]" in request.refusals[0]
+        (told,) = request.replies
+        assert told.stands
+        assert "[Errno 28]" in told.problem
         assert stand.driver.safety.estop
         (request,) = stand.ask("estop")
-        assert request.replies[0].state == "estop"
-        assert (tmp_path / "robot" / CONFIG.robot.id / "estop").exists()
-        monkeypatch.setattr(Path, "unlink", full)
-        (request,) = stand.ask("clear")
-        assert "not cleared: [Errno 28]" in request.refusals[0]
+        assert (request.replies[0].state, request.replies[0].problem) == ("estop", "")
+        with monkeypatch.context() as patch:
+            patch.setattr(statefile, "write_atomically", full)
+            (request,) = stand.ask("clear")
+        assert "[Errno 28]" in request.replies[0].problem
+        assert request.replies[0].halts
         assert stand.driver.safety.estop
-        monkeypatch.undo()
         (request,) = stand.ask("clear")
         assert request.replies[0].state != "estop"
+        assert request.replies[0].halts == ()
+
+
+def test_a_release_that_comes_late_or_is_meant_for_another_life_releases_nothing(
+    tmp_path: Path,
+) -> None:
+    with standing(tmp_path) as stand:
+        stand.ask("estop")
+        for life, until_s in ((LIFE, clock_s() - 0.1), (ACTOR, clock_s() + 1.0)):
+            late = Request(Release(numbers=(0,), deadlines=(Deadline(life=life, until_s=until_s),)))
+            stand.bus.commands = [late]
+            stand.until(lambda asked=late: asked.replies, "an answer")
+            assert late.replies[0].state == "estop"
+        assert stand.driver.safety.estop
+
+
+def test_a_driver_that_starts_again_stands_by_what_is_on_disk(tmp_path: Path) -> None:
+    for order, state in (("estop", "estop"), ("pause", "paused")):
+        folder = tmp_path / order
+        with standing(folder) as stand:
+            stand.ask(order)
+        with standing(folder) as stand:
+            (request,) = stand.ask("clear" if order == "pause" else "resume")
+            assert request.replies[0].state == state
+            assert not stand.moved
 
 
 def test_a_robot_that_may_not_move_asks_for_no_actions(tmp_path: Path) -> None:

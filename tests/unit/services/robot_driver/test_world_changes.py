@@ -405,7 +405,7 @@ def drive_together(driver: Driver, actor: Actor, actions: int) -> list[Episode]:
         action = actor.act(observation)
         if not driver.apply_due(action.episode):
             assert action.action is not None
-            driver.execute(action.action)
+            driver.execute(action.action, action.actor_life)
         observation = driver.observe()
 
 

@@ -194,9 +194,16 @@ class Replay:
         return sum(e.dropped_samples for e in self.episodes)
 
 
+def finish(actor: Actor, observation: Observation) -> Episode | None:
+    """Let an observation end the episode that tells: the robot executed what this actor sent."""
+    action = actor.open.steps[-1].action if len(actor.open) else None
+    told = {"action": action, "actor_life": actor.life if len(actor.open) else ""}
+    return actor.finish(observation.model_copy(update=told))
+
+
 def drive(actor: Actor, replay: Replay, observation: Observation) -> Action:
     """One observation as the service handles it: finish, commit, act."""
-    episode = actor.finish(observation)
+    episode = finish(actor, observation)
     if episode is not None:
         actor.committed(replay.commit(episode))
     return actor.act(observation)
@@ -293,7 +300,7 @@ def test_filling_acts_uniformly_at_random_and_marks_its_submissions() -> None:
         actions.append(actor.act(observe(sequence)))
     assert min(np.bincount([a.action for a in actions], minlength=3)) > 60
     assert not any(a.greedy for a in actions)
-    episode = actor.finish(observe(300, bump=True))
+    episode = finish(actor, observe(300, bump=True))
     assert episode is not None
     assert episode.fill
     assert set(np.frombuffer(episode.sample_episodes, "<u4")) == {2}
@@ -303,7 +310,7 @@ def test_a_bump_before_the_first_action_stores_nothing() -> None:
     """E11: contact that still holds at the start ends no episode; one action is always taken."""
     (actor, _), replay = make_actor(), Replay()
     actor.begin(progress(), observe(0, bump=True))
-    assert actor.finish(observe(0, bump=True)) is None
+    assert finish(actor, observe(0, bump=True)) is None
     drive(actor, replay, observe(0, bump=True))
     drive(actor, replay, observe(1, bump=True))
     (episode,) = replay.episodes
@@ -338,7 +345,7 @@ def test_what_breaks_the_sequence_interrupts_the_episode(broken: dict[str, Any])
     for sequence in range(7):
         drive(actor, replay, observe(sequence))
     observation = observe(**{"sequence": 7, **broken})
-    episode = actor.finish(observation)
+    episode = finish(actor, observation)
     assert episode is not None
     assert (episode.ended, episode.bump, sequences(episode)) == ("interrupted", False, [0, 1, 2])
     assert (episode.dropped_samples, episode.dropped_episodes) == (4, 0)
@@ -367,7 +374,7 @@ def test_contact_of_a_motion_interrupts_the_episode_and_is_no_bump() -> None:
     actor.begin(progress(), observe(0))
     for sequence in range(7):
         drive(actor, replay, observe(sequence))
-    episode = actor.finish(observe(7, bump=True, interruption="moved"))
+    episode = finish(actor, observe(7, bump=True, interruption="moved"))
     assert episode is not None
     assert (episode.ended, sequences(episode)) == ("interrupted", [0, 1, 2])
     assert episode.dropped_samples == 4
@@ -378,7 +385,7 @@ def test_an_action_that_was_never_executed_is_neither_sample_nor_action() -> Non
     actor.begin(progress(), observe(0))
     for sequence in range(8):
         drive(actor, replay, observe(sequence))
-    episode = actor.finish(observe(7, attempt=1, interruption="late"))
+    episode = finish(actor, observe(7, attempt=1, interruption="late"))
     assert episode is not None
     assert (sequences(episode), episode.dropped_samples) == ([0, 1, 2], 4)
     assert (episode.actions, episode.fitness, episode.last_sequence) == (7, 7, 6)
@@ -412,7 +419,7 @@ def test_a_short_interrupted_episode_is_reported_with_the_next_submission() -> N
     actor.begin(progress(), observe(0))
     for sequence in range(3):
         drive(actor, replay, observe(sequence))
-    assert actor.finish(observe(3, interruption="pause")) is None
+    assert finish(actor, observe(3, interruption="pause")) is None
     actor.act(observe(3))
     drive(actor, replay, observe(4, bump=True))
     (episode,) = replay.episodes
@@ -427,9 +434,9 @@ def test_weights_may_change_at_the_boundary_only() -> None:
     assert actor.at_boundary
     drive(actor, replay, observe(0))
     assert not actor.at_boundary
-    actor.finish(observe(1))
+    finish(actor, observe(1))
     assert not actor.at_boundary
-    actor.finish(observe(1, bump=True))
+    finish(actor, observe(1, bump=True))
     assert actor.at_boundary
 
 
@@ -458,7 +465,8 @@ def test_rewards_use_the_version_in_force_when_they_are_computed() -> None:
 @example(events=["go"] * 16 + ["bump", "go", "late"], cut=14)
 def test_a_restored_actor_continues_as_if_nothing_had_happened(events: list[str], cut: int) -> None:
     runs = []
-    for restart_at in (None, min(cut, len(events) - 1)):
+    cut = min(cut, len(events) - 1)
+    for restart_at in (None, cut):
         (actor, predictor), replay = make_actor(), Replay()
         first = observe(0)
         actor.begin(progress(), first)
@@ -472,12 +480,89 @@ def test_a_restored_actor_continues_as_if_nothing_had_happened(events: list[str]
             )
             if sequence == restart_at:
                 state = msgpack.unpackb(msgpack.packb(actor.state()))
-                actor = Actor(CONFIG, "robot1", OTHER_LIFE, predictor)  # type: ignore[arg-type]
+                actor = Actor(CONFIG, "robot1", LIFE, predictor)  # type: ignore[arg-type]
                 actor.restore(state)
                 actor.begin(replay.progress(), observation)
             actions.append(drive(actor, replay, observation))
-        runs.append((actions, replay.episodes, actor.state()))
+        # A process numbers its submissions from 0.
+        episodes = [e.model_copy(update={"number": 0}) for e in replay.episodes]
+        runs.append((actions, episodes, actor.state()))
     assert runs[0] == runs[1]
+
+
+def restored(actor: Actor, life: str) -> Actor:
+    """The same actor in a new process."""
+    other, _ = make_actor()
+    other = Actor(CONFIG, "robot1", life, FakePredictor())  # type: ignore[arg-type]
+    other.restore(msgpack.unpackb(msgpack.packb(actor.state())))
+    return other
+
+
+def test_a_restored_actor_has_a_life_of_its_own_and_knows_its_earlier_actions() -> None:
+    (actor, _), replay = make_actor(), Replay()
+    actor.begin(progress(), observe(0))
+    for sequence in range(6):
+        drive(actor, replay, observe(sequence))
+    other = restored(actor, OTHER_LIFE)
+    observation = observe(
+        6, bump=True, action=actor.open.steps[-1].action, actor_life=LIFE, life=NEXT_LIFE,
+        earlier=(LIFE,),
+    )  # fmt: skip
+    other.begin(replay.progress(), observation)
+    episode = other.finish(observation)
+    assert episode is not None
+    assert (episode.ended, episode.life, episode.number) == ("bump", OTHER_LIFE, 0)
+    assert (sequences(episode), episode.robot_life) == ([0, 1, 2, 3, 4, 5], NEXT_LIFE)
+
+
+@pytest.mark.parametrize("told", [{"action": 1}, {"actor_life": OTHER_LIFE}, {"action": None}])
+def test_what_another_actor_had_executed_is_never_stored(told: dict[str, Any]) -> None:
+    (actor, _), replay = make_actor(), Replay()
+    actor.begin(progress(), observe(0))
+    for sequence in range(7):
+        drive(actor, replay, observe(sequence))
+    mine = actor.open.steps[-1].action
+    told = {"action": mine, "actor_life": LIFE, **told}
+    if told["action"] == 1:
+        told["action"] = (mine + 1) % 3
+    episode = actor.finish(observe(7, bump=True, **told))
+    assert episode is not None
+    assert (episode.ended, sequences(episode)) == ("interrupted", [0, 1])
+    assert (episode.last_sequence, episode.actions, actor.foreign_actions) == (5, 6, 1)
+    drive(actor, replay, observe(7, bump=True))
+    drive(actor, replay, observe(8, bump=True))
+    assert sequences(replay.episodes[-1]) == [7]
+
+
+def test_steps_that_replay_has_already_are_not_stored_again() -> None:
+    (actor, _), replay = make_actor(), Replay()
+    actor.begin(progress(), observe(0))
+    for sequence in range(6):
+        drive(actor, replay, observe(sequence))
+    for stored in (
+        {"robot_life": LIFE, "last_sequence": 20},  # another process went on with this driver
+        {"robot_life": NEXT_LIFE, "last_sequence": 3},  # and with the next
+    ):
+        other = restored(actor, OTHER_LIFE)
+        other.begin(progress(**stored), observe(22, life=stored["robot_life"]))
+        assert len(other.open) == 0
+        assert finish(other, observe(22, life=stored["robot_life"])) is None
+
+
+def test_a_submission_that_is_refused_is_counted_as_dropped() -> None:
+    (actor, _), replay = make_actor(), Replay()
+    actor.begin(progress(), observe(0))
+    for sequence in range(3):
+        drive(actor, replay, observe(sequence))
+    episode = finish(actor, observe(3, bump=True))
+    assert episode is not None
+    actor.lose(episode)
+    actor.begin(replay.progress(), observe(3, bump=True))
+    actor.act(observe(3, bump=True))
+    drive(actor, replay, observe(4, bump=True))
+    assert [(e.number, e.dropped_samples, e.dropped_episodes) for e in replay.episodes] == [
+        (1, 3, 1)
+    ]
 
 
 def test_damaged_saved_state_is_told_by_its_kind_of_error() -> None:
@@ -551,8 +636,7 @@ def test_lost_actions_are_counted_once_whoever_is_killed_and_interrupted(events:
             interruption=interruption,
         )
         if event == "kill actor":
-            actor, _ = make_actor()
-            actor.life = NEXT_LIFE
+            actor = Actor(CONFIG, "robot1", NEXT_LIFE, FakePredictor())  # type: ignore[arg-type]
             actor.begin(replay.progress(), observation)
         drive(actor, replay, observation)
         stored = sum(e.count for e in replay.episodes)
