@@ -17,7 +17,7 @@ def stop_all(bus: Bus) -> str:
     """Tell all robots at once to stop and stay stopped; what each answered, in one line."""
     robots = sorted({peer.id for peer in bus.peers() if peer.service == DRIVER.name})
     if not robots:
-        return "emergency stop NOT sent: there is no robot"
+        return "emergency stop NOT sent: no robot answers"
     answers = dict.fromkeys(robots, "does not answer")
     threads = [
         threading.Thread(target=_stop, args=(bus, robot, answers), daemon=True) for robot in robots

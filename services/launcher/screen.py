@@ -16,7 +16,7 @@ from services.launcher.live import RunView
 log = logging.getLogger(__name__)
 
 WAKE_S = 1.0
-LAST_S = 0.3
+LAST_S = 0.2
 """Time that is left for the view when all has ended, and for the closing line: a stop must stay
 within five seconds."""
 
