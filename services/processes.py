@@ -31,6 +31,8 @@ class Process:
     """Place in the order of stopping, from 0; processes of one stage stop at the same time."""
     may_finish: bool = True
     """Whether exit code 0 means that it is done; otherwise it is restarted."""
+    patience: int = 1
+    """How many times `bus.hang_s` it may be silent: more where one step of its work takes long."""
     per_robot: bool = False
     """Whether every robot has one of its own, whose id is that of the robot."""
 
@@ -65,6 +67,7 @@ REPLAY = Process(
     "Keep the replay memory on disk: store, discard, equalise, serve changes.",
     extras=("replay",),
     stop_stage=2,
+    patience=5,  # a transaction over the whole memory
 )
 LEARNER = Process(
     "learner",
@@ -72,6 +75,7 @@ LEARNER = Process(
     "Train the network, keep checkpoints, publish the target network.",
     extras=("learner",),
     stop_stage=2,
+    patience=5,  # two transfers of the memory of up to a minute each, a checkpoint
 )
 ACTOR = Process(
     "actor",

@@ -127,6 +127,11 @@ class Bus:
         """Undeclare everything and leave; may be called twice."""
         self._session.close()  # type: ignore[no-untyped-call]
 
+    @property
+    def connected(self) -> bool:
+        """Whether a router answers now; one that is gone or hangs counts until its lease ends."""
+        return bool(self._session.info.routers_zid())
+
     def inbox(self) -> Inbox:
         """A new inbox for one thread."""
         return Inbox(self)

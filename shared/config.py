@@ -66,6 +66,18 @@ class BusConfig(Section):
     """Large messages between services of one machine go through shared memory if possible."""
     heartbeat_s: float = Field(default=1.0, gt=0.0, le=10.0)
     """Period of status messages; three missed ones count as silence."""
+    hang_s: float = Field(default=60.0, ge=0.0, le=3600.0)
+    """`corridor up` kills and restarts a service that sends no status for longer; replay and
+    learner after five times, one that just starts after ten times as long. 0: never."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if 0.0 < self.hang_s < 3 * self.heartbeat_s:
+            raise ValueError(
+                f"bus.hang_s ({self.hang_s}) must be 0 or at least three times bus.heartbeat_s "
+                f"({self.heartbeat_s})"
+            )
+        return self
 
 
 class CameraConfig(Section):

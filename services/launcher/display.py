@@ -40,11 +40,11 @@ class Lines:
     def __init__(self, output: TextIO, clock: Callable[[], float] = time.monotonic) -> None:
         self._output, self._clock = output, clock
         self._next_s = 0.0
-        self._shown: tuple[int, str] = (0, "")
+        self._shown: tuple[int, str, str] = (0, "", "")
 
     def show(self, view: RunView) -> None:
         """Write a line if it is time, or if something else is wrong than before."""
-        state = (len(warnings(view)), view.note)
+        state = (len(warnings(view)), view.told, view.note)
         if self._clock() < self._next_s and state == self._shown:
             return
         self._next_s, self._shown = self._clock() + LINE_EVERY_S, state
@@ -59,5 +59,8 @@ def display_for(output: TextIO) -> Iterator[Display]:
     if not console.is_terminal:
         yield Lines(output)
         return
-    with Live(console=console, auto_refresh=False) as live:
+    # What else is printed must not wait for this terminal, which may block.
+    with Live(
+        console=console, auto_refresh=False, redirect_stdout=False, redirect_stderr=False
+    ) as live:
         yield Table(live)

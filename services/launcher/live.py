@@ -44,6 +44,10 @@ class RunView:
     heartbeat_s: float = 1.0
     note: str = ""
     """What the whole run does, such as "stopping"; empty while it drives."""
+    told: str = ""
+    """What became of the last order given by a key."""
+    keys: bool = False
+    """Whether keys are read."""
 
 
 # ---------------------------------------------------------------- words
@@ -140,7 +144,7 @@ def line(view: RunView) -> str:
         learner = snapshot.learner.message
         parts += [f"weights {learner.weights_version}", f"learner {learner_doing(learner)}"]
     parts += [f"! {text}" for text in warnings(view)]
-    return " | ".join([*parts, *([view.note] if view.note else [])])
+    return " | ".join([*parts, *(text for text in (view.told, view.note) if text)])
 
 
 # ---------------------------------------------------------------- live table
@@ -155,8 +159,11 @@ def panel(view: RunView) -> RenderableType:
     for row in _rows(view):
         table.add_row(*row)
     problems = [Text(f"! {text}", style="yellow") for text in warnings(view)]
+    if view.told:
+        problems.append(Text(view.told, style="bold red"))
     title = f"run {view.run}   {duration(view.uptime_s)}"
-    foot = view.note or "Ctrl-C stops; the same command continues"
+    key = "space: emergency stop; " if view.keys else ""
+    foot = view.note or f"{key}Ctrl-C stops; the same command continues"
     return Panel(Group(table, *problems), title=title, subtitle=foot, title_align="left")
 
 

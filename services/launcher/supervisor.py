@@ -1,4 +1,4 @@
-"""Child processes: start them, restart what crashes, end them all in order.
+"""Child processes: start them, restart what crashes or hangs, end them all in order.
 
 A child that exits with 0 was asked to stop and stays stopped. Exit codes 2, 3 and 4 (wrong
 configuration, bad state, role taken) would come again: they end everything, with the child's own
@@ -17,6 +17,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -26,6 +27,8 @@ log = logging.getLogger(__name__)
 
 STAGE_ENDS_S = (0.8, 1.6, 3.4, 3.9)
 """When each stage of a stop is over at the latest. After the last one, what is left is killed."""
+KILLED_S = 1.0
+"""A killed process is gone by then, or waits for a disk, and cannot be killed."""
 FIRST_DELAY_S, LONGEST_DELAY_S = 0.25, 10.0
 STEADY_S = 30.0
 """A child that ran this long is restarted at once when it crashes."""
@@ -120,6 +123,10 @@ class Supervisor:
             return Ending(0, "all services have stopped")
         return None
 
+    def give_up(self, name: str, reason: str) -> None:
+        """Kill a child that hangs; its end is then answered by a restart, like a crash."""
+        next(child for child in self._children if child.spec.name == name).give_up(reason)
+
     def statuses(self) -> tuple[ChildStatus, ...]:
         """How each child is doing, in the order of the specs."""
         return tuple(child.status() for child in self._children)
@@ -156,7 +163,7 @@ class _Child:
         self._starts, self._offset = 0, 0
         self._started_s, self._due_s = 0.0, 0.0
         self._delay_s = FIRST_DELAY_S
-        self._note = ""
+        self._note, self._given_up = "", ""
 
     def start(self, environment: Mapping[str, str], descriptors: tuple[int, ...]) -> None:
         with self._output.open("ab") as stream:
@@ -192,7 +199,8 @@ class _Child:
         if time.monotonic() - self._started_s > STEADY_S:
             self._delay_s = FIRST_DELAY_S
         how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-        self._note = f"{how}: {self.last_line()}".removesuffix(": ")
+        self._note = self._given_up or f"{how}: {self.last_line()}".removesuffix(": ")
+        self._given_up = ""
         self._due_s = time.monotonic() + self._delay_s
         log.warning("%s crashed (%s), restart in %.1f s", self.spec.name, self._note, self._delay_s)
         self._delay_s = min(2 * self._delay_s, LONGEST_DELAY_S)
@@ -227,8 +235,16 @@ class _Child:
         if self.is_alive():
             log.warning("%s does not stop: killed", self.spec.name)
             os.killpg(self.process.pid, signal.SIGKILL)
-        self.process.wait()
+        with suppress(subprocess.TimeoutExpired):
+            self.process.wait(KILLED_S)
         self._forget()
+
+    def give_up(self, reason: str) -> None:
+        """Kill the process now, for this reason."""
+        if self.process is not None and self.is_alive():
+            self._given_up = reason
+            log.warning("%s: %s: killed, restarted", self.spec.name, reason)
+            os.killpg(self.process.pid, signal.SIGKILL)
 
     def _forget(self) -> None:
         """Close our end of the tether of an ended process."""

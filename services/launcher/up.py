@@ -7,32 +7,31 @@ import os
 import random
 import signal
 import socket
-import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
-from rich.console import Console
-
-from services.launcher.display import display_for
+from services.launcher.keys import Keys
 from services.launcher.live import RunView
+from services.launcher.screen import Screen, say
 from services.launcher.supervisor import ChildSpec, Ending, Supervisor
-from services.monitor.heartbeats import Reader, Snapshot
+from services.launcher.watchdog import Watchdog
+from services.launcher.watcher import Watcher
 from services.monitor.running import locked
 from services.processes import COMMAND, ROUTER, SERVICES, Process
 from shared import run_record, settings
-from shared.bus import Bus
 from shared.config import BusConfig, Config
-from shared.errors import ConfigError, RouterMissing
+from shared.errors import ConfigError
 from shared.numerics import settle_all
 
 log = logging.getLogger(__name__)
 
 TICK_S = 0.25
+STOP_KEY = " "
+"""Emergency stop of all robots."""
 PORTS = range(10000, 30000)
 """Kernels give none of these to outgoing connections, so a restarted router finds its port free."""
 
@@ -73,38 +72,59 @@ def run_all(config: Config, folder: Path, *, listen: str | None, given: bool) ->
         supervisor = Supervisor(specs, folder / "logs", environment, [lock])
         ending = supervise(config, supervisor, stop)
     text = ending.reason if ending.code else f"{ending.reason}; the run lies in {folder}"
-    console = Console(stderr=ending.code != 0, highlight=False, soft_wrap=True)
-    console.print(f"corridor: {text}", markup=False)
+    say(f"corridor: {text}", 2 if ending.code else 1)
     return ending.code
 
 
 def supervise(config: Config, supervisor: Supervisor, stop: threading.Event) -> Ending:
-    """Keep the children running and show how they do until there is a reason to end."""
-    start_s = time.monotonic()
-    with display_for(sys.stdout) as display, Watcher(config) as watcher, supervisor:
+    """Keep the children running until there is a reason to end; nothing here can block.
+
+    Views go to the screen's thread. Keys are read, and the emergency stop is given, in another.
+    """
+    start_s, watchdog = time.monotonic(), Watchdog(config)
+    with (
+        Screen() as screen,
+        Watcher(config) as watcher,
+        Keys(lambda key: watcher.halt() if key == STOP_KEY else None) as keys,
+        supervisor,
+    ):
         while True:
-            ending = supervisor.poll()
-            snapshot = watcher.snapshot()
-            wanted = config.run.episodes
-            if ending is None and wanted and snapshot.episodes_done >= wanted:
-                ending = Ending(0, f"{wanted} episodes are done")
-            if ending is None and stop.is_set():
-                ending = Ending(0, "all stopped")
-            view = RunView(
-                config.run.name,
-                config.bus.endpoint,
-                time.monotonic() - start_s,
-                snapshot,
-                supervisor.statuses(),
-                wanted,
-                config.bus.heartbeat_s,
-                "stopping" if ending else "",
-            )
-            display.show(view)
+            now_s = time.monotonic()
+            ending = supervisor.poll() or _wanted(config, watcher, stop)
+            view = _view(config, now_s - start_s, watcher, supervisor, keys)
             if ending is not None:
+                screen.show(replace(view, note="stopping"), last=True)
                 watcher.release()
                 return ending
+            screen.show(view)
+            if hung := watchdog.look(now_s, watcher.sight, view.children):
+                supervisor.give_up(*hung)
             stop.wait(TICK_S)
+
+
+def _wanted(config: Config, watcher: Watcher, stop: threading.Event) -> Ending | None:
+    """An end that was asked for."""
+    wanted = config.run.episodes
+    if wanted and watcher.sight.snapshot.episodes_done >= wanted:
+        return Ending(0, f"{wanted} episodes are done")
+    return Ending(0, "all stopped") if stop.is_set() else None
+
+
+def _view(
+    config: Config, uptime_s: float, watcher: Watcher, supervisor: Supervisor, keys: Keys
+) -> RunView:
+    """What is known now."""
+    return RunView(
+        config.run.name,
+        config.bus.endpoint,
+        uptime_s,
+        watcher.sight.snapshot,
+        supervisor.statuses(),
+        config.run.episodes,
+        config.bus.heartbeat_s,
+        told=watcher.told,
+        keys=keys.active,
+    )
 
 
 def child_specs(config: Config, stored: Config, folder: Path, own: str | None) -> list[ChildSpec]:
@@ -167,48 +187,3 @@ def _log_to(folder: Path) -> None:
     folder.mkdir(exist_ok=True)
     form = "%(asctime)s up %(levelname)s %(message)s"
     logging.basicConfig(filename=folder / "up.log", level=logging.INFO, format=form, force=True)
-
-
-class Watcher:
-    """Reads heartbeats, from the moment the router answers. Use as a context manager.
-
-    A thread does it, because connecting may take a second, and Ctrl-C must not wait for that.
-    """
-
-    def __init__(self, config: Config) -> None:
-        self._config = config
-        self._done = threading.Event()
-        self._snapshot = Snapshot()
-        self._thread = threading.Thread(target=self._watch, name="watcher", daemon=True)
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.release()
-        self._thread.join(2.0)
-
-    def release(self) -> None:
-        """Begin to leave the bus, without waiting for it."""
-        self._done.set()
-
-    def snapshot(self) -> Snapshot:
-        """The newest heartbeats; empty before the router answers."""
-        return self._snapshot
-
-    def _watch(self) -> None:
-        while not self._done.is_set():
-            try:
-                with Bus(self._config.bus, self._config.run.name) as bus:
-                    reader = Reader(bus.inbox())
-                    while not self._done.wait(TICK_S):
-                        reader.update()
-                        self._snapshot = reader.snapshot()
-            except RouterMissing:
-                self._done.wait(TICK_S)

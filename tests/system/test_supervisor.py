@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from terminals import full_pipe
 
 from benchmarks.waiting import wait_until
 from services.launcher.supervisor import ChildSpec, ChildStatus, Ending, Supervisor
@@ -68,6 +69,17 @@ def test_a_killed_child_is_restarted(tmp_path: Path) -> None:
         os.kill(running.pids()["actor"], signal.SIGKILL)
         wait_until(lambda: status(running, "actor").restarts == 1, 20, "a restart")
         assert status(running, "actor").note == "signal SIGKILL"
+
+
+def test_a_child_that_is_given_up_is_killed_and_restarted(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with supervisor(tmp_path, child("driver", SLEEP)) as running:
+        os.kill(running.pids()["driver"], signal.SIGSTOP)
+        running.give_up("driver", "no heartbeat for 31 s")
+        wait_until(lambda: status(running, "driver").restarts == 1, 20, "a restart")
+        assert status(running, "driver").note == "no heartbeat for 31 s"
+    assert "driver: no heartbeat for 31 s: killed, restarted" in caplog.text
 
 
 @pytest.mark.parametrize("code", [2, 3])
@@ -132,7 +144,9 @@ def test_stubborn_children_are_gone_within_five_seconds(tmp_path: Path) -> None:
 
 
 @contextmanager
-def up(folder: Path, *sources: str) -> Iterator[subprocess.Popen[str]]:
+def up(
+    folder: Path, *sources: str, output: int = subprocess.PIPE
+) -> Iterator[subprocess.Popen[str]]:
     """`corridor up` with fake children that each write `<number>.pid`; killed at the end."""
     script = Path(__file__).with_name("up_with_fakes.py")
     marked = [
@@ -142,7 +156,7 @@ def up(folder: Path, *sources: str) -> Iterator[subprocess.Popen[str]]:
     ]
     with subprocess.Popen(
         [sys.executable, str(script), str(folder), *marked],
-        stdout=subprocess.PIPE,
+        stdout=output,
         stderr=subprocess.PIPE,
         text=True,
     ) as process:
@@ -184,6 +198,18 @@ def test_a_signal_stops_everything_within_five_seconds(
     assert not any(exists(pid) for pid in children)
     assert not is_up(tmp_path)
     assert not (tmp_path / "endpoint").exists()
+
+
+def test_output_that_nobody_reads_stops_neither_supervision_nor_the_end(tmp_path: Path) -> None:
+    with full_pipe() as write, up(tmp_path, SLEEP, output=write) as process:
+        (pid,) = fake_pids(tmp_path, 1)
+        os.kill(pid, signal.SIGKILL)
+        wait_until(lambda: fake_pids(tmp_path, 1) != [pid], 20, "a restart")
+        children = family(process)
+        process.send_signal(signal.SIGTERM)
+        _, errors = process.communicate(timeout=20)
+    assert (process.returncode, errors) == (0, "")
+    assert not any(exists(pid) for pid in children)
 
 
 def test_nothing_is_left_after_kill_9(tmp_path: Path) -> None:

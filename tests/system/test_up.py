@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from terminals import Terminal
 
 from benchmarks.waiting import wait_until
 from experiments.report.run_folder import read_run
@@ -26,10 +27,14 @@ SMALL = (
 ENVIRONMENT = {k: v for k, v in os.environ.items() if not k.startswith("CORRIDOR_")}
 
 
-def start(folder: Path, *options: str) -> subprocess.Popen[str]:
+def command(folder: Path, *options: str) -> list[str]:
     sets = [f"--set={item}" for item in SMALL]
+    return [*CORRIDOR, "up", "--run-dir", str(folder), *sets, *options]
+
+
+def start(folder: Path, *options: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [*CORRIDOR, "up", "--run-dir", str(folder), *sets, *options],
+        command(folder, *options),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -119,6 +124,37 @@ def test_killed_services_are_restarted_and_the_run_goes_on(tmp_path: Path) -> No
         assert numbers == list(range(1, len(numbers) + 1))
     finally:
         process.kill()
+
+
+def test_a_frozen_driver_is_killed_and_the_run_goes_on(tmp_path: Path) -> None:
+    process = start(tmp_path, "--set=bus.hang_s=6.0")
+    try:
+        wait_until((tmp_path / "episodes.csv").exists, 60, "metrics")
+        wait_until(lambda: episode_numbers(tmp_path), 60, "an episode")
+        os.kill(started(tmp_path, "driver")[-1], signal.SIGSTOP)
+        wait_until(partial(was_restarted, tmp_path, "driver"), 60, "driver again")
+        assert "driver: no heartbeat for " in (tmp_path / "logs" / "up.log").read_text()
+        before = len(episode_numbers(tmp_path))
+        wait_until(lambda: len(episode_numbers(tmp_path)) >= before + 2, 60, "two more episodes")
+        process.send_signal(signal.SIGINT)
+        output = finish(process, 20)
+        assert "driver was restarted once, last after no heartbeat for " in output
+    finally:
+        process.kill()
+
+
+def test_the_space_key_stops_the_robot_and_ctrl_c_the_run(tmp_path: Path) -> None:
+    with Terminal(command(tmp_path), env={**ENVIRONMENT, "TERM": "xterm"}) as person:
+        wait_until(lambda: "robot robotino1" in person.shown(), 60, "the robot is there")
+        assert not person.gives_lines()
+        person.press(b" ")
+        told = "emergency stop sent; robots: robotino1 stands"
+        wait_until(lambda: told in person.shown(), 20, "what was done")
+        assert (tmp_path / "robot" / "robotino1" / "estop").exists()
+        person.press(b"\x03")
+        assert wait_until(lambda: "all stopped" in person.shown(), 20, "the end")
+        assert person.process.wait(20) == 0
+        assert person.gives_lines()
 
 
 def started(folder: Path, name: str) -> list[int]:

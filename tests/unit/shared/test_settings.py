@@ -75,6 +75,7 @@ def test_every_preset_is_valid_and_lists_differences_only(name: str) -> None:
             "robot.speed_m_s=1.5",
             ["robot.speed_m_s (1.5) must not exceed robot.max_speed_m_s (0.8)"],
         ),
+        ("bus.hang_s=2", ["bus.hang_s (2.0) must be 0 or at least three times bus.heartbeat_s"]),
     ],
 )
 def test_wrong_values_name_key_expectation_value_and_source(

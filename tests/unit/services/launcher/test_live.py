@@ -142,6 +142,14 @@ def test_warnings(given: dict[str, Any], expected: str) -> None:
     assert f"! {expected}" in line(view(**given))
 
 
+def test_the_key_and_what_became_of_it_are_shown() -> None:
+    told = "12:00:00 emergency stop sent; robots: r1 stands"
+    assert "space" not in text(full())
+    assert "space: emergency stop" in text(full(keys=True))
+    assert told in text(full(told=told))
+    assert told in line(full(told=told))
+
+
 def test_a_slow_heartbeat_is_not_silence() -> None:
     assert warnings(view(learner=Seen(LEARNER, 25.0), heartbeat_s=10.0)) == []
 
@@ -214,9 +222,10 @@ def test_plain_lines_come_now_and_then_and_at_once_with_news() -> None:
     restarting = full(children=[ChildStatus("actor", "restarting", 1, "exit code 1")])
     lines = shown_lines(
         [(0.0, full()), (1.0, full()), (2.0, restarting), (3.0, restarting),
-         (2.1 + LINE_EVERY_S, restarting), (2.2 + LINE_EVERY_S, full(note="stopping"))]
+         (2.1 + LINE_EVERY_S, restarting), (2.2 + LINE_EVERY_S, full(told="stop sent")),
+         (2.3 + LINE_EVERY_S, full(told="stop sent", note="stopping"))]
     )  # fmt: skip
-    assert len(lines) == 4
+    assert len(lines) == 5
     assert "restarted" in lines[1]
     assert lines[-1].endswith("stopping")
 

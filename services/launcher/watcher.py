@@ -1,0 +1,82 @@
+"""How a run looks from the bus, and the one order that `corridor up` gives its robots."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from dataclasses import dataclass, field
+from typing import Self
+
+from services.launcher.halting import stop_all
+from services.monitor.heartbeats import Reader, Snapshot
+from shared.bus import Bus
+from shared.config import Config
+from shared.errors import RouterMissing
+
+log = logging.getLogger(__name__)
+LOOK_S = 0.25
+
+
+@dataclass(frozen=True)
+class Sight:
+    """One look at the bus."""
+
+    snapshot: Snapshot = field(default_factory=Snapshot)
+    connected: bool = False
+    """Whether the router answers; without it nobody is heard."""
+
+
+class Watcher:
+    """Reads heartbeats, from the moment the router answers. Use as a context manager.
+
+    A thread does it, because connecting may take a second, and Ctrl-C must not wait for that.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._done = threading.Event()
+        self._bus: Bus | None = None
+        self.sight = Sight()
+        """The newest look; replaced as a whole by each one."""
+        self.told = ""
+        """What became of the last order, and when."""
+        self._thread = threading.Thread(target=self._watch, name="watcher", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.release()
+        self._thread.join(2.0)
+
+    def release(self) -> None:
+        """Begin to leave the bus, without waiting for it."""
+        self._done.set()
+
+    def halt(self) -> None:
+        """Stop all robots now, over the connection that is open (any thread; waits for answers)."""
+        bus, at = self._bus, time.strftime("%H:%M:%S")
+        try:
+            told = stop_all(bus) if bus else "emergency stop NOT sent: no router answers"
+        except Exception as error:  # noqa: BLE001  (whatever it is, the person must see it)
+            told = f"emergency stop NOT sent: {error}"
+        log.warning("%s", told)
+        self.told = f"{at} {told}"
+
+    def _watch(self) -> None:
+        while not self._done.is_set():
+            try:
+                with Bus(self._config.bus, self._config.run.name) as self._bus:
+                    self._look(self._bus)
+            except RouterMissing:
+                self.sight = Sight()
+                self._done.wait(LOOK_S)
+        self._bus = None
+
+    def _look(self, bus: Bus) -> None:
+        reader = Reader(bus.inbox())
+        while not self._done.wait(LOOK_S):
+            reader.update()
+            self.sight = Sight(reader.snapshot(), bus.connected)
