@@ -8,11 +8,12 @@ import time
 from dataclasses import dataclass, field
 from typing import Self
 
-from services.launcher.halting import stop_all
+from services.monitor.halting import halt
 from services.monitor.heartbeats import Reader, Snapshot
 from shared.bus import Bus
 from shared.config import Config
 from shared.errors import RouterMissing
+from shared.halts import ALL
 
 log = logging.getLogger(__name__)
 LOOK_S = 0.25
@@ -56,14 +57,27 @@ class Watcher:
         self._done.set()
 
     def halt(self) -> None:
-        """Stop all robots now, over the connection that is open (any thread; waits for answers)."""
-        bus, at = self._bus, time.strftime("%H:%M:%S")
+        """Stop all robots now, over the connection that is open (any thread).
+
+        It goes on until all stand, and tells on the way which do.
+        """
+        at, told = time.strftime("%H:%M:%S"), list[str]()
+
+        def tell(line: str) -> None:
+            log.warning("emergency stop: %s", line)
+            told.append(line)
+            self.told = f"{at} emergency stop: {'; '.join(told)}"
+
+        if self._bus is None:
+            tell("NOT sent: no router answers")
+            return
+        tell("sent")
         try:
-            told = stop_all(bus) if bus else "emergency stop NOT sent: no router answers"
+            stand = halt(self._bus, "estop", ALL, tell, ended=self._done.is_set)
         except Exception as error:  # noqa: BLE001  (whatever it is, the person must see it)
-            told = f"emergency stop NOT sent: {error}"
-        log.warning("%s", told)
-        self.told = f"{at} {told}"
+            tell(str(error))
+        else:
+            tell("all stand" if stand else "not all stand")
 
     def _watch(self) -> None:
         while not self._done.is_set():
