@@ -57,7 +57,7 @@ def carried() -> list[type[messages.Message]]:
             for field in cls.model_fields.values():
                 for inner in _classes(field.annotation):
                     found[inner] = None
-    return list(found)
+    return [*found, messages.Refusal]
 
 
 def configuration_tables() -> str:
