@@ -13,7 +13,7 @@ from cluster import ALL, Cluster, make_config
 from fakes import message
 
 from benchmarks.waiting import wait_until
-from shared.codec import encode
+from shared.codec import decode, encode
 from shared.keys import STREAMS, Stream
 from shared.messages import (
     Action,
@@ -23,6 +23,8 @@ from shared.messages import (
     Message,
     MiniBatchRequest,
     Observation,
+    Refusal,
+    Release,
     ReplayState,
     RobotState,
     WorldChange,
@@ -32,6 +34,8 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
 REQUESTS = [s for s in STREAMS if s.delivery == "request"]
 TAKEN = [s for s in STREAMS if s.name in ("observation", "action", "replay_state", "learner_state")]
 """Published streams that a service takes in; the others only the monitor reads."""
+UNCOUNTED = ("ping", "stop")
+"""Requests whose refusals no heartbeat counts."""
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +61,22 @@ def attacker(cluster: Cluster) -> Iterator[zenoh.Session]:
         yield session
 
 
+def ask_all(attacker: zenoh.Session, key: str, payload: bytes | None) -> list[zenoh.Reply]:
+    """What every life that serves a key answers."""
+    return list(
+        attacker.get(
+            key,
+            zenoh.handlers.FifoChannel(64),
+            payload=payload,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=10.0,
+        )
+    )
+
+
 def ident(stream: Stream) -> str:
-    return "replay-main" if stream.name == "service" else "robotino1"
+    return "replay-main" if stream.name in UNCOUNTED else "robotino1"
 
 
 def example(stream: Stream) -> Message:
@@ -71,6 +89,8 @@ def example(stream: Stream) -> Message:
         return MiniBatchRequest(size=1, key=1)
     if stream.request is WorldChange:
         return WorldChange(kind="remove", name="box")
+    if stream.request is Release:
+        return Release(numbers=(1,), deadlines=())
     return message(stream.request)
 
 
@@ -100,7 +120,8 @@ def refused(cluster: Cluster, stream: Stream) -> int:
     states = {
         "observation": ("actor/robotino1/state", ActorState),
         "action": ("robot/robotino1/state", RobotState),
-        "robot_command": ("robot/robotino1/state", RobotState),
+        "halt": ("robot/robotino1/state", RobotState),
+        "release": ("robot/robotino1/state", RobotState),
         "robot_world": ("robot/robotino1/state", RobotState),
         "replay_state": ("learner/main/state", LearnerState),
         "weights": ("learner/main/state", LearnerState),
@@ -119,16 +140,19 @@ def test_bad_requests_are_answered_with_an_error(
     cluster: Cluster, attacker: zenoh.Session, stream: Stream
 ) -> None:
     key = stream.key(cluster.config.run.name, ident(stream))
-    before = 0 if stream.name == "service" else refused(cluster, stream)
+    before = 0 if stream.name in UNCOUNTED else refused(cluster, stream)
+    lives = 4 if stream.name in ("halt", "release") else 1  # everybody serves them
     payloads = bad_payloads(stream)
     for name, payload in payloads.items():
-        replies = list(attacker.get(key, payload=payload, timeout=10.0))
-        assert len(replies) == 1, name
-        assert replies[0].ok is None, name
-        assert replies[0].err is not None, name
-    replies = list(attacker.get(key, timeout=10.0))  # no payload at all
-    assert [reply.ok for reply in replies] == [None]
-    if stream.name != "service":  # it has a heartbeat that counts
+        replies = ask_all(attacker, key, payload)
+        assert len(replies) == lives, name
+        for reply in replies:
+            assert reply.ok is None, name
+            assert reply.err is not None, name
+            assert decode(reply.err.payload.to_bytes(), Refusal).final, name
+    replies = ask_all(attacker, key, None)  # no payload at all
+    assert [reply.ok for reply in replies] == [None] * lives
+    if stream.name not in UNCOUNTED:
         expected = before + len(payloads) + 1
         wait_until(lambda: refused(cluster, stream) >= expected, 20, "all are counted")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -97,7 +98,9 @@ def test_a_running_run_is_found_watched_commanded_and_stopped(tmp_path: Path) ->
             return corridor("status", *where, *require).returncode == 0
 
         wait_until(alive, 40, "all services to answer")
-        assert corridor("estop", *where).stdout == "robotino1: estop\n"
+        assert re.match(
+            r"robotino1 \(life [0-9a-f]{12}\): estop, stands\n$", corridor("estop", *where).stdout
+        )
         state = json.loads(corridor("status", *where, "--json").stdout)
         assert state["robots"]["robotino1"]["state"] == "estop"
         assert {service["service"] for service in state["services"]} == set(wanted)
@@ -148,9 +151,9 @@ def test_the_space_key_stops_the_robot_and_ctrl_c_the_run(tmp_path: Path) -> Non
         wait_until(lambda: "robot robotino1" in person.shown(), 60, "the robot is there")
         assert not person.gives_lines()
         person.press(b" ")
-        told = "emergency stop sent; robots: robotino1 stands"
-        wait_until(lambda: told in person.shown(), 20, "what was done")
-        assert (tmp_path / "robot" / "robotino1" / "estop").exists()
+        wait_until(lambda: "all stand" in person.shown(), 20, "what was done")
+        assert "estop, stands" in person.shown()
+        assert (tmp_path / "halts" / "driver-robotino1.msgpack").exists()
         person.press(b"\x03")
         assert wait_until(lambda: "all stopped" in person.shown(), 20, "the end")
         assert person.process.wait(20) == 0
