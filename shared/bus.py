@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Self, TypeVar
 
 import zenoh
@@ -30,6 +31,39 @@ REPLY_LIMIT = 16 * 1024 * 1024
 """Bytes of one reply; larger ones are refused."""
 
 
+def zenoh_settings(
+    mode: str,
+    *,
+    connect: Sequence[str] = (),
+    listen: Sequence[str] = (),
+    lease_ms: int = 2000,
+    shared_memory: bool = True,
+    tls: Mapping[str, object] | None = None,
+) -> dict[str, Any]:
+    """A closed configuration: no scouting, explicit endpoints, quick reconnection.
+
+    With `tls`, endpoints are encrypted, and no message takes a way around that.
+    """
+    ends = [
+        [re.sub("^tcp/", "tls/", end) if tls else end for end in given]
+        for given in (connect, listen)
+    ]
+    link: dict[str, object] = {"tx": {"lease": lease_ms}, **({"tls": tls} if tls else {})}
+    retry = {"period_init_ms": 50, "period_max_ms": 300, "period_increase_factor": 1.5}
+    return {
+        "mode": mode,
+        "connect": {"endpoints": ends[0], "timeout_ms": 1000, "retry": retry},
+        "listen": {"endpoints": ends[1]},
+        "scouting": {
+            "multicast": {"enabled": False},
+            "gossip": {"enabled": False},
+            "delay": 0,
+        },
+        "transport": {"link": link, "shared_memory": {"enabled": shared_memory and not tls}},
+        "adminspace": {"enabled": mode == "router"},
+    }
+
+
 def zenoh_config(
     mode: str,
     *,
@@ -37,28 +71,25 @@ def zenoh_config(
     listen: Sequence[str] = (),
     lease_ms: int = 2000,
     shared_memory: bool = True,
+    credentials: str = "",
 ) -> zenoh.Config:
-    """A closed configuration: no scouting, explicit endpoints, quick reconnection."""
-    config = zenoh.Config()
-    for key, value in {
-        "mode": mode,
-        "connect/endpoints": list(connect),
-        "listen/endpoints": list(listen),
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "scouting/delay": 0,
-        "connect/timeout_ms": 1000,
-        "connect/retry": {
-            "period_init_ms": 50,
-            "period_max_ms": 300,
-            "period_increase_factor": 1.5,
-        },
-        "transport/link/tx/lease": lease_ms,
-        "transport/shared_memory/enabled": shared_memory,
-        "adminspace/enabled": mode == "router",
-    }.items():
-        config.insert_json5(key, json.dumps(value))
-    return config
+    """The same for Zenoh; with a folder of credentials a client encrypts and says who it is."""
+    tls = {
+        "root_ca_certificate": f"{credentials}/ca.pem",
+        "connect_private_key": f"{credentials}/key.pem",
+        "connect_certificate": f"{credentials}/cert.pem",
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+    }
+    settings = zenoh_settings(
+        mode,
+        connect=connect,
+        listen=listen,
+        lease_ms=lease_ms,
+        shared_memory=shared_memory,
+        tls=tls if credentials else None,
+    )
+    return zenoh.Config.from_json5(json.dumps(settings))
 
 
 class Request:
@@ -110,6 +141,7 @@ class Bus:
                     connect=[config.endpoint],
                     lease_ms=config.lease_ms,
                     shared_memory=config.shared_memory,
+                    credentials=config.credentials,
                 )
             )
         except zenoh.ZError as error:
@@ -239,17 +271,24 @@ class Bus:
 
 
 @contextmanager
-def open_router(endpoint: str) -> Iterator[str]:
+def open_router(endpoint: str, file: Path | None = None) -> Iterator[str]:
     """Be a Zenoh router while the block runs; yields the locator it listens on.
 
     Args:
         endpoint: where to listen, such as `tcp/127.0.0.1:7447`; port 0 takes a free one.
+        file: configuration with certificates and allow-lists; None: open to everybody.
 
     Raises:
         ConfigError: it cannot listen there, for instance because the port is in use.
     """
     try:
-        session = zenoh.open(zenoh_config("router", listen=[endpoint]))
+        if file is None:
+            config = zenoh_config("router", listen=[endpoint])
+        else:
+            config = zenoh.Config.from_json5(file.read_text())
+            listen = [re.sub("^tcp/", "tls/", endpoint)]
+            config.insert_json5("listen/endpoints", json.dumps(listen))
+        session = zenoh.open(config)
     except zenoh.ZError as error:
         reason = re.sub(r" at \S+\.rs:\d+\.?", "", str(error))
         raise ConfigError(f"router: cannot listen on {endpoint!r}: {reason}") from error

@@ -24,6 +24,7 @@ from services.launcher.supervisor import ChildSpec, Ending, Supervisor
 from services.monitor.heartbeats import Reader, Snapshot
 from services.monitor.running import locked
 from services.processes import COMMAND, ROUTER, SERVICES, Process
+from services.security.use import refuse_open_door, using
 from shared import run_record, settings
 from shared.bus import Bus
 from shared.config import BusConfig, Config
@@ -37,7 +38,9 @@ PORTS = range(10000, 30000)
 """Kernels give none of these to outgoing connections, so a restarted router finds its port free."""
 
 
-def run_all(config: Config, folder: Path, *, listen: str | None, given: bool) -> int:
+def run_all(
+    config: Config, folder: Path, *, listen: str | None, given: bool, insecure: bool = False
+) -> int:
     """Run everything until Ctrl-C, SIGTERM, the wanted number of episodes or a final error.
 
     Args:
@@ -45,6 +48,7 @@ def run_all(config: Config, folder: Path, *, listen: str | None, given: bool) ->
         folder: run folder.
         listen: where the own router listens; None: on loopback, on a free port.
         given: the endpoint was chosen on purpose, so the router there is used.
+        insecure: the own router may listen beyond loopback without credentials.
 
     Returns:
         The exit code.
@@ -58,6 +62,9 @@ def run_all(config: Config, folder: Path, *, listen: str | None, given: bool) ->
         raise ConfigError(
             f"--listen: starts an own router, but bus.endpoint {config.bus.endpoint!r} was given"
         )
+    watching = using(config, "operator", "watcher").bus.credentials
+    if listen is not None:
+        refuse_open_door(listen, config.bus.credentials, insecure)
     stored = settings.claim(folder, config)
     run_record.begin(folder, stored)
     with locked(folder) as lock, stop_on_signals() as stop:
@@ -66,12 +73,13 @@ def run_all(config: Config, folder: Path, *, listen: str | None, given: bool) ->
         endpoint = reachable(own) if own else config.bus.endpoint
         bus = config.bus.model_copy(update={"endpoint": endpoint})
         config = config.model_copy(update={"bus": bus})
-        (folder / "endpoint").write_text(endpoint + "\n")
+        (folder / "endpoint").write_text(f"{endpoint}\n{config.bus.credentials}\n")
         _log_to(folder / "logs")
-        specs = child_specs(config, stored, folder, own)
+        specs = child_specs(config, stored, folder, own, insecure=insecure)
         environment = {k: v for k, v in os.environ.items() if not k.startswith(settings.ENV_PREFIX)}
         supervisor = Supervisor(specs, folder / "logs", environment, [lock])
-        ending = supervise(config, supervisor, stop)
+        bus = bus.model_copy(update={"credentials": watching})
+        ending = supervise(config.model_copy(update={"bus": bus}), supervisor, stop)
     text = ending.reason if ending.code else f"{ending.reason}; the run lies in {folder}"
     console = Console(stderr=ending.code != 0, highlight=False, soft_wrap=True)
     console.print(f"corridor: {text}", markup=False)
@@ -107,11 +115,14 @@ def supervise(config: Config, supervisor: Supervisor, stop: threading.Event) -> 
             stop.wait(TICK_S)
 
 
-def child_specs(config: Config, stored: Config, folder: Path, own: str | None) -> list[ChildSpec]:
+def child_specs(
+    config: Config, stored: Config, folder: Path, own: str | None, *, insecure: bool = False
+) -> list[ChildSpec]:
     """The processes of a run: our router if `own` tells where it listens, and all services."""
     specs = []
     if own is not None:
-        specs.append(_spec(ROUTER, "--listen", own))
+        secure = ("--credentials", config.bus.credentials) if config.bus.credentials else ()
+        specs.append(_spec(ROUTER, "--listen", own, *secure, *(["--insecure"] * insecure)))
     # What may differ from the stored configuration, such as the endpoint, goes along.
     changes = settings.differences(stored, config)
     options = [f"--set={key}={settings.toml_value(value)}" for key, _, value in changes]

@@ -1,0 +1,196 @@
+"""Keys and certificates, one folder for each credential, and the roster of those that hold.
+
+The authority signs the router's certificate and nothing else. Every other certificate has an issuer
+of its own, whose key is forgotten as soon as it has signed. The router trusts exactly the issuers
+on the roster: a certificate that is taken off it is refused at the door, and one that is made anew
+under the same name does not bring the old one back.
+
+    FOLDER/authority/   key and certificate of the authority, roster.json; stays on this machine
+    FOLDER/router/      key.pem, cert.pem, ca.pem, router.json5
+    FOLDER/<name>/      key.pem, cert.pem, ca.pem: what one process needs
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from ipaddress import ip_address
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from services.security.kinds import Credential, check
+from shared.errors import ConfigError
+
+AUTHORITY_DAYS, DAYS = 7300, 825
+EARLY = timedelta(days=1)
+"""Certificates hold from a day ago: clocks of robots are not exact."""
+HOSTS = ("localhost", "127.0.0.1", "::1")
+ROUTER = "router"
+
+
+@dataclass(frozen=True)
+class Identity:
+    """A certificate with its key."""
+
+    key: ec.EllipticCurvePrivateKey
+    certificate: x509.Certificate
+
+
+def identity(
+    name: str,
+    issuer: Identity | None,
+    until: datetime,
+    *,
+    hosts: Sequence[str] = (),
+    signs: bool = False,
+) -> Identity:
+    """A new key and its certificate, signed by the issuer or, without one, by itself."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    signer = issuer or Identity(key, None)  # type: ignore[arg-type]
+    builder = (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer.certificate.subject if issuer else subject)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(min(datetime.now(UTC), until) - EARLY)
+        .not_valid_after(until)
+        .add_extension(x509.BasicConstraints(ca=signs, path_length=0 if signs else None), True)
+    )
+    if not signs:
+        uses = [ExtendedKeyUsageOID.CLIENT_AUTH]
+        if hosts:
+            uses.append(ExtendedKeyUsageOID.SERVER_AUTH)
+            names = [_host(host) for host in hosts]
+            builder = builder.add_extension(x509.SubjectAlternativeName(names), False)
+        builder = builder.add_extension(x509.ExtendedKeyUsage(uses), False)
+    return Identity(key, builder.sign(signer.key, hashes.SHA256()))
+
+
+def _host(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ip_address(host))
+    except ValueError:
+        return x509.DNSName(host)
+
+
+def pem(certificate: x509.Certificate) -> str:
+    """A certificate as text."""
+    return certificate.public_bytes(serialization.Encoding.PEM).decode()
+
+
+class Authority:
+    """The folder of an authority. Raises ConfigError when there is none."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._home = folder / "authority"
+        try:
+            roster = json.loads((self._home / "roster.json").read_text())
+            key = serialization.load_pem_private_key((self._home / "key.pem").read_bytes(), None)
+            certificate = x509.load_pem_x509_certificate((self._home / "cert.pem").read_bytes())
+        except FileNotFoundError as error:
+            raise ConfigError(
+                f"{folder}: has no authority; make one: corridor secure init {folder}"
+            ) from error
+        assert isinstance(key, ec.EllipticCurvePrivateKey)
+        self._identity = Identity(key, certificate)
+        self.hosts: list[str] = roster["hosts"]
+        self._issuers: dict[str, str] = roster["issuers"]
+        self.credentials = {
+            name: Credential(entry["kind"], tuple(entry["names"]))
+            for name, entry in roster["credentials"].items()
+        }
+
+    @classmethod
+    def create(cls, folder: Path) -> Authority:
+        """The authority of a folder; a new one if it has none."""
+        home = folder / "authority"
+        if not (home / "roster.json").exists():
+            until = datetime.now(UTC) + timedelta(days=AUTHORITY_DAYS)
+            made = identity("corridor authority", None, until, signs=True)
+            _write_identity(home, made, made.certificate)
+            write_private(home / "roster.json", b'{"hosts": [], "credentials": {}, "issuers": {}}')
+        return cls(folder)
+
+    @property
+    def trusted(self) -> str:
+        """Certificates by which the router knows who may connect."""
+        return "".join([pem(self._identity.certificate), *self._issuers.values()])
+
+    def add(self, credential: Credential, until: datetime) -> Path:
+        """Issue a key and a certificate; one of the same name no longer holds. Returns its folder.
+
+        Raises:
+            ConfigError: kind or names make no sense.
+        """
+        check(credential)
+        issuer = identity(f"issuer of {credential.name}", None, until, signs=True)
+        made = identity(credential.name, issuer, until)
+        folder = self.folder / credential.name
+        _write_identity(folder, made, self._identity.certificate)
+        self.credentials[credential.name] = credential
+        self._issuers[credential.name] = pem(issuer.certificate)
+        self._save()
+        return folder
+
+    def revoke(self, credential: Credential) -> None:
+        """Take a certificate off the roster, and its folder away. Raises ConfigError: none such."""
+        if credential.name not in self.credentials:
+            known = ", ".join(sorted(self.credentials)) or "none"
+            raise ConfigError(f"{credential.name}: expected one of {known}")
+        del self.credentials[credential.name], self._issuers[credential.name]
+        self._save()
+        shutil.rmtree(self.folder / credential.name, ignore_errors=True)
+
+    def certify_router(self, hosts: Sequence[str], until: datetime) -> Path:
+        """Issue the certificate of the router for these names and addresses; returns its folder."""
+        self.hosts = sorted({*HOSTS, *hosts})
+        made = identity(ROUTER, self._identity, until, hosts=self.hosts)
+        _write_identity(self.folder / ROUTER, made, self._identity.certificate)
+        self._save()
+        return self.folder / ROUTER
+
+    def expiry(self, name: str) -> datetime:
+        """When the newest certificate of a credential ends."""
+        data = (self.folder / name / "cert.pem").read_bytes()
+        return x509.load_pem_x509_certificate(data).not_valid_after_utc
+
+    def _save(self) -> None:
+        entries = {
+            name: {"kind": one.kind, "names": one.names} for name, one in self.credentials.items()
+        }
+        roster = {"hosts": self.hosts, "credentials": entries, "issuers": self._issuers}
+        write_private(self._home / "roster.json", json.dumps(roster, indent=1).encode())
+
+
+def _write_identity(folder: Path, made: Identity, authority: x509.Certificate) -> None:
+    private = made.key.private_bytes(
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.PKCS8,
+        serialization.NoEncryption(),
+    )
+    write_private(folder / "key.pem", private)
+    write_private(folder / "cert.pem", pem(made.certificate).encode())
+    write_private(folder / "ca.pem", pem(authority).encode())
+
+
+def write_private(path: Path, data: bytes) -> None:
+    """Write a file that only its owner reads, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    beside = path.with_name(path.name + ".new")
+    beside.unlink(missing_ok=True)
+    with os.fdopen(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    beside.replace(path)
