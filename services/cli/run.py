@@ -26,6 +26,20 @@ from services.cli.options import (
 if TYPE_CHECKING:
     from services.monitor.operator import RobotOrder
 
+GivenRouterOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Use the router at this endpoint instead of starting one.", rich_help_panel=CHOOSE
+    ),
+]
+OwnRouterOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Where the own router listens; default: loopback, a free port.",
+        rich_help_panel=CHOOSE,
+    ),
+]
+
 
 def add_to(app: typer.Typer) -> None:
     """Add the commands."""
@@ -45,20 +59,8 @@ def up(
     run: RunOption = None,
     seed: SeedOption = None,
     run_dir: RunDirOption = None,
-    endpoint: Annotated[
-        str | None,
-        typer.Option(
-            help="Use the router at this endpoint instead of starting one.",
-            rich_help_panel=CHOOSE,
-        ),
-    ] = None,
-    listen: Annotated[
-        str | None,
-        typer.Option(
-            help="Where the own router listens; default: loopback, a free port.",
-            rich_help_panel=CHOOSE,
-        ),
-    ] = None,
+    endpoint: GivenRouterOption = None,
+    listen: OwnRouterOption = None,
     credentials: CredentialsOption = None,
     insecure: InsecureOption = False,
     episodes: Annotated[

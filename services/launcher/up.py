@@ -50,20 +50,15 @@ def run_all(
         given: the endpoint was chosen on purpose, so the router there is used.
         insecure: the own router may listen beyond loopback without credentials.
 
-    Returns:
-        The exit code.
-
-    Raises:
-        ConfigError: the folder belongs to another configuration or is in use.
+    Returns the exit code. Raises ConfigError: the folder belongs to another configuration or is in
+    use, or the router must not listen there.
     """
     folder = folder.absolute()
     given = given or config.bus.endpoint != BusConfig().endpoint
-    if given and listen is not None:
-        raise ConfigError(
-            f"--listen: starts an own router, but bus.endpoint {config.bus.endpoint!r} was given"
-        )
-    watching = using(config, "operator", "watcher").bus.credentials
     if listen is not None:
+        if given:
+            endpoint = config.bus.endpoint
+            raise ConfigError(f"--listen: bus.endpoint {endpoint!r} was given, of another router")
         refuse_open_door(listen, config.bus.credentials, insecure)
     stored = settings.claim(folder, config)
     run_record.begin(folder, stored)
@@ -78,8 +73,7 @@ def run_all(
         specs = child_specs(config, stored, folder, own, insecure=insecure)
         environment = {k: v for k, v in os.environ.items() if not k.startswith(settings.ENV_PREFIX)}
         supervisor = Supervisor(specs, folder / "logs", environment, [lock])
-        bus = bus.model_copy(update={"credentials": watching})
-        ending = supervise(config.model_copy(update={"bus": bus}), supervisor, stop)
+        ending = supervise(config, supervisor, stop)
     text = ending.reason if ending.code else f"{ending.reason}; the run lies in {folder}"
     console = Console(stderr=ending.code != 0, highlight=False, soft_wrap=True)
     console.print(f"corridor: {text}", markup=False)
@@ -187,7 +181,7 @@ class Watcher:
     """
 
     def __init__(self, config: Config) -> None:
-        self._config = config
+        self._config = using(config, "operator", "watcher")
         self._done = threading.Event()
         self._snapshot = Snapshot()
         self._thread = threading.Thread(target=self._watch, name="watcher", daemon=True)
