@@ -145,7 +145,9 @@ class Bus:
                 )
             )
         except zenoh.ZError as error:
-            raise RouterMissing(f"no Zenoh router at {config.endpoint}: {error}") from error
+            takes = f" that takes the credentials in {config.credentials}"
+            there = config.endpoint + takes * bool(config.credentials)
+            raise RouterMissing(f"no Zenoh router at {there}: {error}") from error
 
     def __enter__(self) -> Self:
         return self

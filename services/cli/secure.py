@@ -57,7 +57,7 @@ def init(
     days: DaysOption = DAYS,
     deliver: Annotated[
         Path | None,
-        typer.Option(help="Copy each credential to DELIVER/ROLE, too, for containers."),
+        typer.Option(help="Copy to folders below, named like roles, where there are such, too."),
     ] = None,
 ) -> None:
     """Make an authority and all that a run needs; made again, only what is missing or ends soon."""
@@ -131,6 +131,5 @@ def _tell(made: Any) -> None:
 
 
 def _copy(source: Path, target: Path) -> None:
-    target.mkdir(parents=True, exist_ok=True)
-    for path in source.iterdir():
+    for path in source.iterdir() if target.is_dir() else ():
         shutil.copy2(path, target / path.name)
