@@ -27,8 +27,8 @@ from services.monitor import health
 from services.security import router_file
 from services.security.authority import Authority
 from services.security.kinds import Credential
-from services.security.use import using
 from services.security.rules import TOKENS
+from services.security.use import using
 from shared.bus import Bus, zenoh_config
 from shared.config import BusConfig
 from shared.errors import RouterMissing
