@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -31,39 +31,6 @@ REPLY_LIMIT = 16 * 1024 * 1024
 """Bytes of one reply; larger ones are refused."""
 
 
-def zenoh_settings(
-    mode: str,
-    *,
-    connect: Sequence[str] = (),
-    listen: Sequence[str] = (),
-    lease_ms: int = 2000,
-    shared_memory: bool = True,
-    tls: Mapping[str, object] | None = None,
-) -> dict[str, Any]:
-    """A closed configuration: no scouting, explicit endpoints, quick reconnection.
-
-    With `tls`, endpoints are encrypted, and no message takes a way around that.
-    """
-    ends = [
-        [re.sub("^tcp/", "tls/", end) if tls else end for end in given]
-        for given in (connect, listen)
-    ]
-    link: dict[str, object] = {"tx": {"lease": lease_ms}, **({"tls": tls} if tls else {})}
-    retry = {"period_init_ms": 50, "period_max_ms": 300, "period_increase_factor": 1.5}
-    return {
-        "mode": mode,
-        "connect": {"endpoints": ends[0], "timeout_ms": 1000, "retry": retry},
-        "listen": {"endpoints": ends[1]},
-        "scouting": {
-            "multicast": {"enabled": False},
-            "gossip": {"enabled": False},
-            "delay": 0,
-        },
-        "transport": {"link": link, "shared_memory": {"enabled": shared_memory and not tls}},
-        "adminspace": {"enabled": mode == "router"},
-    }
-
-
 def zenoh_config(
     mode: str,
     *,
@@ -73,23 +40,43 @@ def zenoh_config(
     shared_memory: bool = True,
     credentials: str = "",
 ) -> zenoh.Config:
-    """The same for Zenoh; with a folder of credentials a client encrypts and says who it is."""
+    """A closed configuration: no scouting, explicit endpoints, quick reconnection.
+
+    With a folder of credentials a client encrypts everything and says who it is.
+    """
     tls = {
         "root_ca_certificate": f"{credentials}/ca.pem",
         "connect_private_key": f"{credentials}/key.pem",
         "connect_certificate": f"{credentials}/cert.pem",
         "enable_mtls": True,
-        "verify_name_on_connect": True,
     }
-    settings = zenoh_settings(
-        mode,
-        connect=connect,
-        listen=listen,
-        lease_ms=lease_ms,
-        shared_memory=shared_memory,
-        tls=tls if credentials else None,
-    )
-    return zenoh.Config.from_json5(json.dumps(settings))
+    config = zenoh.Config()
+    for key, value in {
+        "mode": mode,
+        "connect/endpoints": [encrypted(end) if credentials else end for end in connect],
+        "listen/endpoints": list(listen),
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "scouting/delay": 0,
+        "connect/timeout_ms": 1000,
+        "connect/retry": {
+            "period_init_ms": 50,
+            "period_max_ms": 300,
+            "period_increase_factor": 1.5,
+        },
+        "transport/link/tx/lease": lease_ms,
+        # It would go around encryption.
+        "transport/shared_memory/enabled": shared_memory and not credentials,
+        "adminspace/enabled": mode == "router",
+        **({"transport/link/tls": tls} if credentials else {}),
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def encrypted(endpoint: str) -> str:
+    """The same endpoint with TLS."""
+    return re.sub("^tcp/", "tls/", endpoint)
 
 
 class Request:
@@ -288,8 +275,7 @@ def open_router(endpoint: str, file: Path | None = None) -> Iterator[str]:
             config = zenoh_config("router", listen=[endpoint])
         else:
             config = zenoh.Config.from_json5(file.read_text())
-            listen = [re.sub("^tcp/", "tls/", endpoint)]
-            config.insert_json5("listen/endpoints", json.dumps(listen))
+            config.insert_json5("listen/endpoints", json.dumps([encrypted(endpoint)]))
         session = zenoh.open(config)
     except zenoh.ZError as error:
         reason = re.sub(r" at \S+\.rs:\d+\.?", "", str(error))

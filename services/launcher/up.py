@@ -68,7 +68,8 @@ def run_all(
         endpoint = reachable(own) if own else config.bus.endpoint
         bus = config.bus.model_copy(update={"endpoint": endpoint})
         config = config.model_copy(update={"bus": bus})
-        (folder / "endpoint").write_text(f"{endpoint}\n{config.bus.credentials}\n")
+        credentials = Path(bus.credentials).absolute() if bus.credentials else ""
+        (folder / "endpoint").write_text(f"{endpoint}\n{credentials}\n")
         _log_to(folder / "logs")
         specs = child_specs(config, stored, folder, own, insecure=insecure)
         environment = {k: v for k, v in os.environ.items() if not k.startswith(settings.ENV_PREFIX)}

@@ -9,15 +9,15 @@ from __future__ import annotations
 import json
 from base64 import b64encode
 from pathlib import Path
-from typing import Any
 
 from services.security.authority import ROUTER, Authority, write_private
 from services.security.rules import access_control, size_limits
-from shared.bus import zenoh_settings
+from shared.bus import zenoh_config
 from shared.keys import MIB
 
 FILE = "router.json5"
 LISTEN = "tls/0.0.0.0:7447"
+AS_ALWAYS = ("mode", "connect", "listen", "scouting", "transport", "adminspace")
 LARGEST = 32 * MIB
 """The router puts together no larger message, whatever its key."""
 
@@ -25,15 +25,16 @@ LARGEST = 32 * MIB
 def write(authority: Authority) -> Path:
     """Write the router's configuration for those who are on the roster now."""
     folder = authority.folder / ROUTER
-    tls = {
+    plain = zenoh_config("router", listen=[LISTEN], shared_memory=False)
+    settings = {key: json.loads(plain.get_json(key)) for key in AS_ALWAYS}
+    settings["transport"]["link"]["rx"]["max_message_size"] = LARGEST
+    settings["transport"]["link"]["tls"] = {
         "root_ca_certificate_base64": _base64(authority.trusted.encode()),
         "listen_private_key_base64": _base64((folder / "key.pem").read_bytes()),
         "listen_certificate_base64": _base64((folder / "cert.pem").read_bytes()),
         "enable_mtls": True,
         "close_link_on_expiration": True,
     }
-    settings: dict[str, Any] = zenoh_settings("router", listen=[LISTEN], tls=tls)
-    settings["transport"]["link"]["rx"] = {"max_message_size": LARGEST}
     settings["access_control"] = access_control(list(authority.credentials.values()))
     settings["low_pass_filter"] = size_limits()
     head = "// Made by `corridor secure`; made anew whenever a credential is added or revoked.\n"

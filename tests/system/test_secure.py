@@ -29,7 +29,7 @@ from services.security.authority import Authority
 from services.security.kinds import Credential
 from services.security.rules import TOKENS
 from services.security.use import using
-from shared.bus import Bus, zenoh_config
+from shared.bus import Bus, open_router, zenoh_config
 from shared.config import BusConfig
 from shared.errors import RouterMissing
 from shared.keys import OBSERVATION, ROBOT_COMMAND, SERVICE, Stream
@@ -255,6 +255,12 @@ def test_only_certificates_that_hold_get_a_connection(site: Site) -> None:
         Bus(missing, RUN)
 
 
+def test_a_client_takes_a_router_at_the_host_of_its_certificate_only(site: Site) -> None:
+    with open_router("tcp/127.0.0.3:0", site.folder / "router" / "router.json5") as elsewhere:
+        with pytest.raises(zenoh.ZError):
+            site._replace(endpoint=elsewhere).open("replay")
+
+
 def lines(path: Path) -> Sequence[str]:
     return path.read_text().splitlines() if path.exists() else ()
 
@@ -276,4 +282,8 @@ def test_a_run_learns_behind_a_guarded_router(tmp_path: Path, run_name: str) -> 
         for name in ("driver", "actor", "replay", "learner"):  # with no more than its own
             own = using(config, name, f"{name}-{config.robot.id}")
             assert health.check(name, own)
+        cluster.stop("router")
+        before = len(lines(done))
+        cluster.start("router")
+        wait_until(lambda: len(lines(done)) > before + 1, 60, "more episodes learnt")
         cluster.stop_all()
