@@ -256,9 +256,9 @@ def test_only_certificates_that_hold_get_a_connection(site: Site) -> None:
 
 
 def test_a_client_takes_a_router_at_the_host_of_its_certificate_only(site: Site) -> None:
-    with open_router("tcp/127.0.0.3:0", site.folder / "router" / "router.json5") as elsewhere:
-        with pytest.raises(zenoh.ZError):
-            site._replace(endpoint=elsewhere).open("replay")
+    file = site.folder / "router" / "router.json5"
+    with open_router("tcp/127.0.0.3:0", file) as elsewhere, pytest.raises(zenoh.ZError):
+        site._replace(endpoint=elsewhere).open("replay")
 
 
 def lines(path: Path) -> Sequence[str]:
