@@ -66,9 +66,9 @@ def init(
     wanted += [Credential("driver", (name,)) for name in robot or []]
     soon = datetime.now(UTC) + RENEWED
     for credential in wanted:
-        if credential.name not in made.credentials or made.expiry(credential.name) < soon:
+        if made.ends(credential.name) < soon:
             made.add(credential, _until(days))
-    if not made.hosts or not set(host or []) <= set(made.hosts) or made.expiry("router") < soon:
+    if not set(host or []) <= set(made.hosts) or made.ends("router") < soon:
         made.certify_router([*made.hosts, *(host or [])], _until(days))
     _tell(made)
     for folder_name in ["router", *(one.name for one in wanted)] if deliver else []:
@@ -111,7 +111,7 @@ def list_(folder: FolderOption = DEFAULT) -> None:
     """List who may connect, and until when."""
     made = _module("authority").Authority(folder)
     for name in ["router", *sorted(made.credentials)]:
-        typer.echo(f"{name:24} until {made.expiry(name):%Y-%m-%d}")
+        typer.echo(f"{name:24} until {made.ends(name):%Y-%m-%d}")
 
 
 def _module(name: str) -> Any:

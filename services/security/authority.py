@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
 from pathlib import Path
+from typing import Any
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
@@ -29,7 +30,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from services.security.kinds import Credential, check
 from shared.errors import ConfigError
 
-AUTHORITY_DAYS, DAYS = 7300, 825
+AUTHORITY_DAYS = 7300
 EARLY = timedelta(days=1)
 """Certificates hold from a day ago: clocks of robots are not exact."""
 HOSTS = ("localhost", "127.0.0.1", "::1")
@@ -55,7 +56,6 @@ def identity(
     """A new key and its certificate, signed by the issuer or, without one, by itself."""
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-    signer = issuer or Identity(key, None)  # type: ignore[arg-type]
     builder = (
         x509.CertificateBuilder()
         .subject_name(subject)
@@ -73,7 +73,7 @@ def identity(
             names = [_host(host) for host in hosts]
             builder = builder.add_extension(x509.SubjectAlternativeName(names), False)
         builder = builder.add_extension(x509.ExtendedKeyUsage(uses), False)
-    return Identity(key, builder.sign(signer.key, hashes.SHA256()))
+    return Identity(key, builder.sign(issuer.key if issuer else key, hashes.SHA256()))
 
 
 def _host(host: str) -> x509.GeneralName:
@@ -89,13 +89,13 @@ def pem(certificate: x509.Certificate) -> str:
 
 
 class Authority:
-    """The folder of an authority. Raises ConfigError when there is none."""
+    """The folder of an authority, and the roster of certificates that hold."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self._home = folder / "authority"
+        """Raises ConfigError when there is none."""
+        self.folder, self._home = folder, folder / "authority"
         try:
-            roster = json.loads((self._home / "roster.json").read_text())
+            self._roster: dict[str, Any] = json.loads((self._home / "roster.json").read_text())
             key = serialization.load_pem_private_key((self._home / "key.pem").read_bytes(), None)
             certificate = x509.load_pem_x509_certificate((self._home / "cert.pem").read_bytes())
         except FileNotFoundError as error:
@@ -104,12 +104,6 @@ class Authority:
             ) from error
         assert isinstance(key, ec.EllipticCurvePrivateKey)
         self._identity = Identity(key, certificate)
-        self.hosts: list[str] = roster["hosts"]
-        self._issuers: dict[str, str] = roster["issuers"]
-        self.credentials = {
-            name: Credential(entry["kind"], tuple(entry["names"]))
-            for name, entry in roster["credentials"].items()
-        }
 
     @classmethod
     def create(cls, folder: Path) -> Authority:
@@ -119,58 +113,70 @@ class Authority:
             until = datetime.now(UTC) + timedelta(days=AUTHORITY_DAYS)
             made = identity("corridor authority", None, until, signs=True)
             _write_identity(home, made, made.certificate)
-            write_private(home / "roster.json", b'{"hosts": [], "credentials": {}, "issuers": {}}')
+            write_private(home / "roster.json", b"{}")
         return cls(folder)
+
+    @property
+    def credentials(self) -> dict[str, Credential]:
+        """Who may connect, by name."""
+        return {
+            name: Credential(entry["kind"], tuple(entry["names"]))
+            for name, entry in self._roster.items()
+            if name != ROUTER
+        }
+
+    @property
+    def hosts(self) -> list[str]:
+        """Names and addresses of the router; empty before it has a certificate."""
+        return list(self._roster.get(ROUTER, {}).get("names", []))
 
     @property
     def trusted(self) -> str:
         """Certificates by which the router knows who may connect."""
-        return "".join([pem(self._identity.certificate), *self._issuers.values()])
+        return "".join(entry["issuer"] for entry in self._roster.values())
+
+    def ends(self, name: str) -> datetime:
+        """When the certificate of this name ends; long ago if there is none."""
+        until = self._roster.get(name, {}).get("until", "0001-01-01T00:00:00+00:00")
+        return datetime.fromisoformat(until)
 
     def add(self, credential: Credential, until: datetime) -> Path:
         """Issue a key and a certificate; one of the same name no longer holds. Returns its folder.
 
-        Raises:
-            ConfigError: kind or names make no sense.
+        Raises ConfigError: kind or names make no sense.
         """
         check(credential)
         issuer = identity(f"issuer of {credential.name}", None, until, signs=True)
         made = identity(credential.name, issuer, until)
-        folder = self.folder / credential.name
-        _write_identity(folder, made, self._identity.certificate)
-        self.credentials[credential.name] = credential
-        self._issuers[credential.name] = pem(issuer.certificate)
-        self._save()
-        return folder
+        return self._enter(credential.name, credential.kind, credential.names, issuer, made)
+
+    def certify_router(self, hosts: Sequence[str], until: datetime) -> Path:
+        """Issue the certificate of the router for these names and addresses; returns its folder."""
+        hosts = sorted({*HOSTS, *hosts})
+        made = identity(ROUTER, self._identity, until, hosts=hosts)
+        return self._enter(ROUTER, ROUTER, hosts, self._identity, made)
 
     def revoke(self, credential: Credential) -> None:
         """Take a certificate off the roster, and its folder away. Raises ConfigError: none such."""
         if credential.name not in self.credentials:
             known = ", ".join(sorted(self.credentials)) or "none"
             raise ConfigError(f"{credential.name}: expected one of {known}")
-        del self.credentials[credential.name], self._issuers[credential.name]
+        del self._roster[credential.name]
         self._save()
         shutil.rmtree(self.folder / credential.name, ignore_errors=True)
 
-    def certify_router(self, hosts: Sequence[str], until: datetime) -> Path:
-        """Issue the certificate of the router for these names and addresses; returns its folder."""
-        self.hosts = sorted({*HOSTS, *hosts})
-        made = identity(ROUTER, self._identity, until, hosts=self.hosts)
-        _write_identity(self.folder / ROUTER, made, self._identity.certificate)
+    def _enter(
+        self, name: str, kind: str, names: Sequence[str], issuer: Identity, made: Identity
+    ) -> Path:
+        _write_identity(self.folder / name, made, self._identity.certificate)
+        until = made.certificate.not_valid_after_utc.isoformat()
+        entry = {"kind": kind, "names": names, "until": until, "issuer": pem(issuer.certificate)}
+        self._roster[name] = entry
         self._save()
-        return self.folder / ROUTER
-
-    def expiry(self, name: str) -> datetime:
-        """When the newest certificate of a credential ends."""
-        data = (self.folder / name / "cert.pem").read_bytes()
-        return x509.load_pem_x509_certificate(data).not_valid_after_utc
+        return self.folder / name
 
     def _save(self) -> None:
-        entries = {
-            name: {"kind": one.kind, "names": one.names} for name, one in self.credentials.items()
-        }
-        roster = {"hosts": self.hosts, "credentials": entries, "issuers": self._issuers}
-        write_private(self._home / "roster.json", json.dumps(roster, indent=1).encode())
+        write_private(self._home / "roster.json", json.dumps(self._roster, indent=1).encode())
 
 
 def _write_identity(folder: Path, made: Identity, authority: x509.Certificate) -> None:

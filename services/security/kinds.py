@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 ANY = "*"
 """Every run, every robot."""
+LONGEST = 50
+"""Characters of a name: certificates have room for little more."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,8 @@ def check(credential: Credential) -> None:
     fits = {"none": count == 0, "one robot": count == 1, "a person": count <= 1, "robots": True}
     if not fits[meaning]:
         raise ConfigError(f"{credential.kind}: expected {meaning} as names, got {count}")
+    if len(credential.name) > LONGEST:
+        raise ConfigError(f"{credential.kind}: expected names of {LONGEST} characters together")
     for name in credential.names:
         if not NAME.fullmatch(name):
             raise ConfigError(f"{credential.kind}: expected a name like {NAME.pattern}: {name!r}")

@@ -129,7 +129,7 @@ def test_init_again_makes_only_what_is_missing_or_ends_soon(folder: Path) -> Non
     assert set(after) - set(before) == set((folder / "driver-beta").iterdir())
     Authority(folder).add(DRIVER, datetime.now(UTC) + timedelta(days=3))
     assert main(again) == 0
-    assert Authority(folder).expiry("driver-alpha") > datetime.now(UTC) + timedelta(days=800)
+    assert Authority(folder).ends("driver-alpha") > datetime.now(UTC) + timedelta(days=800)
     assert main(["secure", "init", str(folder), "--host", "10.0.0.7"]) == 0
     assert Authority(folder).hosts == ["10.0.0.7", "127.0.0.1", "::1", "lab.example", "localhost"]
 

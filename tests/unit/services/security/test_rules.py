@@ -147,6 +147,7 @@ def test_names_of_credentials(credential: Credential, name: str) -> None:
         (Credential("driver", ("a", "b")), "driver: expected one robot as names, got 2"),
         (Credential("replay", ("a",)), "replay: expected none as names, got 1"),
         (Credential("actor", ("../x",)), "actor: expected a name like"),
+        (Credential("actor", ("a" * 30, "b" * 30)), "actor: expected names of 50 characters"),
         (Credential("driver", ("*",)), "driver: expected a name like"),
     ],
 )
