@@ -44,12 +44,6 @@ def zenoh_config(
 
     With a folder of credentials a client encrypts everything and says who it is.
     """
-    tls = {
-        "root_ca_certificate": f"{credentials}/ca.pem",
-        "connect_private_key": f"{credentials}/key.pem",
-        "connect_certificate": f"{credentials}/cert.pem",
-        "enable_mtls": True,
-    }
     config = zenoh.Config()
     for key, value in {
         "mode": mode,
@@ -68,10 +62,19 @@ def zenoh_config(
         # It would go around encryption.
         "transport/shared_memory/enabled": shared_memory and not credentials,
         "adminspace/enabled": mode == "router",
-        **({"transport/link/tls": tls} if credentials else {}),
+        **({"transport/link/tls": _tls(credentials)} if credentials else {}),
     }.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def _tls(credentials: str) -> dict[str, object]:
+    return {
+        "root_ca_certificate": f"{credentials}/ca.pem",
+        "connect_private_key": f"{credentials}/key.pem",
+        "connect_certificate": f"{credentials}/cert.pem",
+        "enable_mtls": True,
+    }
 
 
 def encrypted(endpoint: str) -> str:

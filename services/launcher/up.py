@@ -57,8 +57,7 @@ def run_all(
     given = given or config.bus.endpoint != BusConfig().endpoint
     if listen is not None:
         if given:
-            endpoint = config.bus.endpoint
-            raise ConfigError(f"--listen: bus.endpoint {endpoint!r} was given, of another router")
+            raise ConfigError(f"--listen: bus.endpoint {config.bus.endpoint!r} was given, too")
         refuse_open_door(listen, config.bus.credentials, insecure)
     stored = settings.claim(folder, config)
     run_record.begin(folder, stored)
