@@ -36,6 +36,12 @@ RUN pip install --no-deps --ignore-installed --prefix /code .
 # ------------------------------------------------ images: an unprivileged user, state below /data
 
 FROM base AS router
+ARG PIP_INDEX_URL=
+# It also makes credentials: docker-compose.yml mounts a volume on each of these folders.
+RUN pip install --constraint constraints.txt '.[secure]' && \
+    install --directory --mode 700 --owner corridor --group corridor /credentials \
+      /deliver/router /deliver/driver /deliver/actor /deliver/replay /deliver/learner \
+      /deliver/operator
 COPY --from=code /code /opt/venv
 USER corridor
 # Run folders are /data/runs/<run name>.

@@ -30,7 +30,7 @@ trap cleanup EXIT
 cp pyproject.toml LICENSE "$project"
 touch "$project/README.md"
 mkdir -p build/wheels build/index
-extras=sim,robotino,ros2,actor,replay,learner,openvino
+extras=sim,robotino,ros2,actor,replay,learner,openvino,secure
 wanted=$(cat pyproject.toml constraints.txt | sha256sum)
 if [ "$(cat build/wheels/of 2>/dev/null)" != "$wanted" ]; then
   echo "fetching wheels into build/wheels"

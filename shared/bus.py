@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Self, TypeVar
 
 import zenoh
@@ -38,12 +39,16 @@ def zenoh_config(
     listen: Sequence[str] = (),
     lease_ms: int = 2000,
     shared_memory: bool = True,
+    credentials: str = "",
 ) -> zenoh.Config:
-    """A closed configuration: no scouting, explicit endpoints, quick reconnection."""
+    """A closed configuration: no scouting, explicit endpoints, quick reconnection.
+
+    With a folder of credentials a client encrypts everything and says who it is.
+    """
     config = zenoh.Config()
     for key, value in {
         "mode": mode,
-        "connect/endpoints": list(connect),
+        "connect/endpoints": [encrypted(end) if credentials else end for end in connect],
         "listen/endpoints": list(listen),
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
@@ -55,11 +60,27 @@ def zenoh_config(
             "period_increase_factor": 1.5,
         },
         "transport/link/tx/lease": lease_ms,
-        "transport/shared_memory/enabled": shared_memory,
+        # It would go around encryption.
+        "transport/shared_memory/enabled": shared_memory and not credentials,
         "adminspace/enabled": mode == "router",
+        **({"transport/link/tls": _tls(credentials)} if credentials else {}),
     }.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def _tls(credentials: str) -> dict[str, object]:
+    return {
+        "root_ca_certificate": f"{credentials}/ca.pem",
+        "connect_private_key": f"{credentials}/key.pem",
+        "connect_certificate": f"{credentials}/cert.pem",
+        "enable_mtls": True,
+    }
+
+
+def encrypted(endpoint: str) -> str:
+    """The same endpoint with TLS."""
+    return re.sub("^tcp/", "tls/", endpoint)
 
 
 class Request:
@@ -112,10 +133,13 @@ class Bus:
                     connect=[config.endpoint],
                     lease_ms=config.lease_ms,
                     shared_memory=config.shared_memory,
+                    credentials=config.credentials,
                 )
             )
         except zenoh.ZError as error:
-            raise RouterMissing(f"no Zenoh router at {config.endpoint}: {error}") from error
+            takes = f" that takes the credentials in {config.credentials}"
+            there = config.endpoint + takes * bool(config.credentials)
+            raise RouterMissing(f"no Zenoh router at {there}: {error}") from error
 
     def __enter__(self) -> Self:
         return self
@@ -324,17 +348,23 @@ def _failure(key: str, reply: zenoh.Reply) -> BusError:
 
 
 @contextmanager
-def open_router(endpoint: str) -> Iterator[str]:
+def open_router(endpoint: str, file: Path | None = None) -> Iterator[str]:
     """Be a Zenoh router while the block runs; yields the locator it listens on.
 
     Args:
         endpoint: where to listen, such as `tcp/127.0.0.1:7447`; port 0 takes a free one.
+        file: configuration with certificates and allow-lists; None: open to everybody.
 
     Raises:
         ConfigError: it cannot listen there, for instance because the port is in use.
     """
     try:
-        session = zenoh.open(zenoh_config("router", listen=[endpoint]))
+        if file is None:
+            config = zenoh_config("router", listen=[endpoint])
+        else:
+            config = zenoh.Config.from_json5(file.read_text())
+            config.insert_json5("listen/endpoints", json.dumps([encrypted(endpoint)]))
+        session = zenoh.open(config)
     except zenoh.ZError as error:
         reason = re.sub(r" at \S+\.rs:\d+\.?", "", str(error))
         raise ConfigError(f"router: cannot listen on {endpoint!r}: {reason}") from error

@@ -58,6 +58,9 @@ class BusConfig(Section):
 
     endpoint: str = Field(default="tcp/127.0.0.1:7447", pattern=r"^[a-z][a-z0-9-]*/\S+$")
     """Where clients connect, and where our own router listens."""
+    credentials: str = ""
+    """Folder with `key.pem`, `cert.pem` and `ca.pem`, or one that `corridor secure init` made;
+    empty: no encryption."""
     lease_ms: int = Field(default=2000, ge=200, le=60000)
     """A frozen or cut-off service counts as gone after this time."""
     request_timeout_s: float = Field(default=5.0, gt=0.0, le=120.0)

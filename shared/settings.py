@@ -25,6 +25,8 @@ from shared.statefile import create, write_atomically
 
 ENV_PREFIX = "CORRIDOR_"
 FILE_NAME = "config.toml"
+SHORT = {"credentials": "bus.credentials"}
+"""Variables of the environment without a section: CORRIDOR_CREDENTIALS."""
 Tree = dict[str, Any]
 
 
@@ -54,6 +56,7 @@ def load(
         # Compose files pass unset variables on as empty ones.
         if name.startswith(ENV_PREFIX) and text:
             key = name.removeprefix(ENV_PREFIX).lower().replace("__", ".")
+            key = SHORT.get(key, key)
             merged.add_text(key, text, f"environment variable {name}")
     for item in overrides:
         key, equals, text = item.partition("=")

@@ -9,6 +9,7 @@ import typer
 
 from services.cli.options import (
     ConfigOption,
+    CredentialsOption,
     EndpointOption,
     RunDirOption,
     RunOption,
@@ -17,7 +18,10 @@ from services.cli.options import (
     load,
     reach,
 )
+from services.security.use import using
 
+DRIVING = ("pilot", "operator")
+"""Credentials for driving: those of a pilot, who may send actions."""
 OneRobot = Annotated[
     str | None,
     typer.Option("--robot", help="Id of the robot; default: the only one of the run."),
@@ -40,6 +44,7 @@ def drive(
     run: RunOption = None,
     run_dir: RunDirOption = None,
     endpoint: EndpointOption = None,
+    credentials: CredentialsOption = None,
     config: ConfigOption = None,
     set_: SetOption = None,
 ) -> None:
@@ -52,7 +57,7 @@ def drive(
     frozen = import_installed("services.commander.frozen", "actor")
     network = load(None, config or frozen.configuration_of(weights), set_).network
     command = import_installed("services.commander.drive", "actor")
-    there = reach(run, run_dir, endpoint)
+    there = reach(run, run_dir, endpoint, credentials, *DRIVING)
     raise typer.Exit(command.run(there, network, weights, robot, actions, typer.echo))
 
 
@@ -61,6 +66,7 @@ def teleop(
     run: RunOption = None,
     run_dir: RunDirOption = None,
     endpoint: EndpointOption = None,
+    credentials: CredentialsOption = None,
 ) -> None:
     """Place a robot by keys: w a s d or arrows, space stops, e is the emergency stop, q quits.
 
@@ -69,7 +75,8 @@ def teleop(
     """
     from services.commander import teleop as command
 
-    raise typer.Exit(command.run(reach(run, run_dir, endpoint), robot, typer.echo))
+    there = reach(run, run_dir, endpoint, credentials, *DRIVING)
+    raise typer.Exit(command.run(there, robot, typer.echo))
 
 
 def record(
@@ -80,15 +87,18 @@ def record(
     run: RunOption = None,
     run_dir: RunDirOption = None,
     endpoint: EndpointOption = None,
+    credentials: CredentialsOption = None,
     config: ConfigOption = None,
 ) -> None:
     """Record what a run publishes and its weights as MCAP, until Ctrl-C.
 
     The configuration is that of the run's folder; --config stands in for it on another machine.
     """
-    loaded = (
-        load(None, config, None, run, None, endpoint) if config else reach(run, run_dir, endpoint)
-    )
+    if config:
+        loaded = load(None, config, None, run, None, endpoint, credentials)
+        loaded = using(loaded, "watcher", "operator")
+    else:
+        loaded = reach(run, run_dir, endpoint, credentials, "watcher", "operator")
     folder = run_dir or Path("runs") / loaded.run.name
     service = import_installed("services.recorder.service", "record")
     from shared.service import setup_logging

@@ -18,6 +18,7 @@ import typer
 from services.cli import driving, experiments, run, services
 from services.cli.emulate import emulate
 from services.cli.options import EXIT_CONFIG, EXIT_CRASH, EXIT_ROLE, EXIT_STATE
+from services.cli.secure import secure
 from services.cli.worlds import obstacle, world
 from shared.errors import ConfigError, CorridorError, RoleTaken, StateError
 
@@ -37,6 +38,7 @@ for group in (driving, services, run, experiments):
 app.add_typer(world, name="world")
 app.add_typer(obstacle, name="obstacle")
 app.add_typer(emulate, name="emulate")
+app.add_typer(secure, name="secure")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -52,6 +52,18 @@ EndpointOption = Annotated[
         rich_help_panel=CHOOSE,
     ),
 ]
+CredentialsOption = Annotated[
+    Path | None,
+    typer.Option(
+        envvar="CORRIDOR_CREDENTIALS",
+        help="Folder of keys and certificates (bus.credentials); see corridor secure.",
+        rich_help_panel=CHOOSE,
+    ),
+]
+InsecureOption = Annotated[
+    bool,
+    typer.Option("--insecure", help="Let the router listen beyond loopback without credentials."),
+]
 SeedOption = Annotated[
     int | None,
     typer.Option(help="Seed of all random draws (run.seed).", rich_help_panel=OURS),
@@ -79,6 +91,7 @@ def load(
     run: str | None = None,
     seed: int | None = None,
     endpoint: str | None = None,
+    credentials: Path | None = None,
     others: Mapping[str, str | int | None] | None = None,
 ) -> Config:
     """The configuration from all sources; dedicated options win over `--set`."""
@@ -88,6 +101,7 @@ def load(
         "run.name": run,
         "run.seed": seed,
         "bus.endpoint": endpoint,
+        "bus.credentials": str(credentials.absolute()) if credentials else None,
     }
     options.update(others or {})
     chosen = [f"{k}={settings.toml_value(v)}" for k, v in options.items() if v is not None]
@@ -99,11 +113,20 @@ def default_folder(config: Config) -> Path:
     return Path("runs") / config.run.name
 
 
-def reach(run: str | None, run_dir: Path | None, endpoint: str | None) -> Config:
-    """How to reach a running run."""
+def reach(
+    run: str | None,
+    run_dir: Path | None,
+    endpoint: str | None,
+    credentials: Path | None,
+    *kinds: str,
+) -> Config:
+    """How to reach a running run, with the first of these kinds of credentials that is there."""
     from services.monitor import running
+    from services.security.use import using
 
-    return running.reach(run_dir, run, endpoint, os.environ)
+    given = str(credentials.absolute()) if credentials else None
+    found = running.reach(run_dir, run, endpoint, os.environ, given)
+    return using(found, *(kinds or ("operator", "watcher")))
 
 
 def import_installed(module: str, extra: str) -> Any:

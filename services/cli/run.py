@@ -9,7 +9,9 @@ import typer
 from services.cli.options import (
     CHOOSE,
     ConfigOption,
+    CredentialsOption,
     EndpointOption,
+    InsecureOption,
     PresetOption,
     RobotOption,
     RunDirOption,
@@ -23,6 +25,20 @@ from services.cli.options import (
 
 if TYPE_CHECKING:
     from services.monitor.halting import RobotOrder
+
+GivenRouterOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Use the router at this endpoint instead of starting one.", rich_help_panel=CHOOSE
+    ),
+]
+OwnRouterOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Where the own router listens; default: loopback, a free port.",
+        rich_help_panel=CHOOSE,
+    ),
+]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -43,20 +59,10 @@ def up(
     run: RunOption = None,
     seed: SeedOption = None,
     run_dir: RunDirOption = None,
-    endpoint: Annotated[
-        str | None,
-        typer.Option(
-            help="Use the router at this endpoint instead of starting one.",
-            rich_help_panel=CHOOSE,
-        ),
-    ] = None,
-    listen: Annotated[
-        str | None,
-        typer.Option(
-            help="Where the own router listens; default: loopback, a free port.",
-            rich_help_panel=CHOOSE,
-        ),
-    ] = None,
+    endpoint: GivenRouterOption = None,
+    listen: OwnRouterOption = None,
+    credentials: CredentialsOption = None,
+    insecure: InsecureOption = False,
     episodes: Annotated[
         int | None,
         typer.Option(help="End by itself after so many episodes (run.episodes); 0: never."),
@@ -67,11 +73,17 @@ def up(
     Ctrl-C stops everything within five seconds; the same command continues the run. All that a
     run produces lies in its folder.
     """
-    loaded = load(preset, config, set_, run, seed, endpoint, {"run.episodes": episodes})
+    loaded = load(
+        preset, config, set_, run, seed, endpoint, credentials, {"run.episodes": episodes}
+    )
     from services.launcher.up import run_all
 
     code = run_all(
-        loaded, run_dir or default_folder(loaded), listen=listen, given=endpoint is not None
+        loaded,
+        run_dir or default_folder(loaded),
+        listen=listen,
+        given=endpoint is not None,
+        insecure=insecure,
     )
     raise typer.Exit(code)
 
@@ -80,6 +92,7 @@ def status(
     run: RunOption = None,
     run_dir: RunDirOption = None,
     endpoint: EndpointOption = None,
+    credentials: CredentialsOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     require: Annotated[
         list[str] | None,
@@ -92,13 +105,16 @@ def status(
     """List the services of a run that are alive, with versions, rates and memory."""
     from services.monitor.status import show
 
-    raise typer.Exit(show(reach(run, run_dir, endpoint), as_json=as_json, require=require or []))
+    raise typer.Exit(
+        show(reach(run, run_dir, endpoint, credentials), as_json=as_json, require=require or [])
+    )
 
 
 def stop(
     run: RunOption = None,
     run_dir: RunDirOption = None,
     endpoint: EndpointOption = None,
+    credentials: CredentialsOption = None,
     service: Annotated[
         list[str] | None,
         typer.Option(metavar="SERVICE", help="Only this service (driver, actor, ...); repeatable."),
@@ -107,7 +123,7 @@ def stop(
     """Ask the services of a run to stop cleanly; `corridor up` ends with them."""
     from services.monitor.operator import stop_services
 
-    raise typer.Exit(stop_services(reach(run, run_dir, endpoint), service or []))
+    raise typer.Exit(stop_services(reach(run, run_dir, endpoint, credentials), service or []))
 
 
 def _add_order(app: typer.Typer, name: RobotOrder, text: str) -> None:
@@ -117,11 +133,12 @@ def _add_order(app: typer.Typer, name: RobotOrder, text: str) -> None:
         run: RunOption = None,
         run_dir: RunDirOption = None,
         endpoint: EndpointOption = None,
+        credentials: CredentialsOption = None,
         robot: RobotOption = None,
     ) -> None:
         from services.monitor.operator import command_robots
 
-        raise typer.Exit(command_robots(reach(run, run_dir, endpoint), name, robot))
+        raise typer.Exit(command_robots(reach(run, run_dir, endpoint, credentials), name, robot))
 
     app.command(name, help=text)(command)
 

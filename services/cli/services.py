@@ -9,7 +9,9 @@ import typer
 
 from services.cli.options import (
     ConfigOption,
+    CredentialsOption,
     EndpointOption,
+    InsecureOption,
     PresetOption,
     RunDirOption,
     RunOption,
@@ -22,6 +24,7 @@ from services.cli.options import (
 )
 from services.launcher.tether import tether
 from services.processes import ROUTER, SERVICES, Process
+from services.security.use import using
 
 if TYPE_CHECKING:
     from shared.config import Config
@@ -45,11 +48,12 @@ def _add_service(app: typer.Typer, process: Process) -> None:
         run: RunOption = None,
         run_dir: RunDirOption = None,
         endpoint: EndpointOption = None,
+        credentials: CredentialsOption = None,
         tethered: TetheredOption = False,
     ) -> None:
         if tethered:
             tether()
-        loaded = load(preset, config, set_, run, seed, endpoint)
+        loaded = load(preset, config, set_, run, seed, endpoint, credentials)
         raise typer.Exit(serve(process, loaded, run_dir or default_folder(loaded)))
 
     app.command(process.name, help=process.purpose)(command)
@@ -62,10 +66,11 @@ def serve(process: Process, config: Config, folder: Path) -> int:
     from shared.settings import claim
 
     life = new_life()
+    own = using(config, process.name, f"{process.name}-{config.robot.id}")
 
     def run() -> None:
         with starting():
-            import_installed(process.module, process.extras[0]).run(config, folder, life)
+            import_installed(process.module, process.extras[0]).run(own, folder, life)
 
     with roles.locked(folder, process.name, process.ident(config.robot.id), life):
         run_record.begin(folder, claim(folder, config))
@@ -84,12 +89,15 @@ def router(
             "free port. Example for all interfaces: tcp/0.0.0.0:7447."
         ),
     ] = None,
+    credentials: CredentialsOption = None,
+    insecure: InsecureOption = False,
     tethered: TetheredOption = False,
 ) -> None:
     """Route between the services of runs until stopped."""
-    loaded = load(preset, config, set_, endpoint=listen)
+    loaded = load(preset, config, set_, endpoint=listen, credentials=credentials)
+    bus = using(loaded, ROUTER.name).bus
     if tethered:
         tether()
     from services.router.service import run as route
 
-    route(loaded.bus.endpoint, typer.echo)
+    route(bus.endpoint, typer.echo, bus.credentials, insecure=insecure)

@@ -11,6 +11,7 @@ from services.cli.options import (
     EXIT_CRASH,
     AtEpisodeOption,
     ConfigOption,
+    CredentialsOption,
     EndpointOption,
     PresetOption,
     RobotOption,
@@ -86,6 +87,7 @@ def world_switch(
     run: RunOption = None,
     run_dir: RunDirOption = None,
     endpoint: EndpointOption = None,
+    credentials: CredentialsOption = None,
     robot: RobotOption = None,
 ) -> None:
     """Let robots of a running simulation go on in another world.
@@ -93,7 +95,7 @@ def world_switch(
     Samples that look ahead across the change are dropped and counted.
     """
     change = {"kind": "switch", "world": name, "start": start, "at_episode": at_episode}
-    raise typer.Exit(_change_world(run, run_dir, endpoint, robot, change))
+    raise typer.Exit(_change_world(run, run_dir, endpoint, credentials, robot, change))
 
 
 @obstacle.command("place")
@@ -110,6 +112,7 @@ def obstacle_place(
     run: RunOption = None,
     run_dir: RunDirOption = None,
     endpoint: EndpointOption = None,
+    credentials: CredentialsOption = None,
     robot: RobotOption = None,
 ) -> None:
     """Let a box stand in the world of a running simulation: solid, and seen."""
@@ -124,7 +127,7 @@ def obstacle_place(
         "rgb": rgb,
     }
     change = {"kind": "place", "box": box, "at_episode": at_episode}
-    raise typer.Exit(_change_world(run, run_dir, endpoint, robot, change))
+    raise typer.Exit(_change_world(run, run_dir, endpoint, credentials, robot, change))
 
 
 @obstacle.command("remove")
@@ -134,21 +137,23 @@ def obstacle_remove(
     run: RunOption = None,
     run_dir: RunDirOption = None,
     endpoint: EndpointOption = None,
+    credentials: CredentialsOption = None,
     robot: RobotOption = None,
 ) -> None:
     """Take a box away again, one that was placed or one that belongs to the world."""
     change = {"kind": "remove", "name": name, "at_episode": at_episode}
-    raise typer.Exit(_change_world(run, run_dir, endpoint, robot, change))
+    raise typer.Exit(_change_world(run, run_dir, endpoint, credentials, robot, change))
 
 
 def _change_world(
     run: str | None,
     run_dir: Path | None,
     endpoint: str | None,
+    credentials: Path | None,
     robot: str | None,
     change: dict[str, Any],
 ) -> int:
     """Wish for a change of the world of a run's robots; returns the exit code."""
     from services.monitor.operator import change_world
 
-    return change_world(reach(run, run_dir, endpoint), robot, **change)
+    return change_world(reach(run, run_dir, endpoint, credentials), robot, **change)

@@ -22,6 +22,7 @@ from services.launcher.watchdog import Watchdog
 from services.launcher.watcher import Watcher
 from services.monitor.running import locked
 from services.processes import COMMAND, ROUTER, SERVICES, Process
+from services.security.use import refuse_open_door
 from shared import run_record, settings
 from shared.config import BusConfig, Config
 from shared.errors import ConfigError
@@ -36,7 +37,9 @@ PORTS = range(10000, 30000)
 """Kernels give none of these to outgoing connections, so a restarted router finds its port free."""
 
 
-def run_all(config: Config, folder: Path, *, listen: str | None, given: bool) -> int:
+def run_all(
+    config: Config, folder: Path, *, listen: str | None, given: bool, insecure: bool = False
+) -> int:
     """Run everything until Ctrl-C, SIGTERM, the wanted number of episodes or a final error.
 
     Args:
@@ -44,19 +47,17 @@ def run_all(config: Config, folder: Path, *, listen: str | None, given: bool) ->
         folder: run folder.
         listen: where the own router listens; None: on loopback, on a free port.
         given: the endpoint was chosen on purpose, so the router there is used.
+        insecure: the own router may listen beyond loopback without credentials.
 
-    Returns:
-        The exit code.
-
-    Raises:
-        ConfigError: the folder belongs to another configuration or is in use.
+    Returns the exit code. Raises ConfigError: the folder belongs to another configuration or is in
+    use, or the router must not listen there.
     """
     folder = folder.absolute()
     given = given or config.bus.endpoint != BusConfig().endpoint
-    if given and listen is not None:
-        raise ConfigError(
-            f"--listen: starts an own router, but bus.endpoint {config.bus.endpoint!r} was given"
-        )
+    if listen is not None:
+        if given:
+            raise ConfigError(f"--listen: bus.endpoint {config.bus.endpoint!r} was given, too")
+        refuse_open_door(listen, config.bus.credentials, insecure)
     stored = settings.claim(folder, config)
     run_record.begin(folder, stored)
     with locked(folder) as lock, stop_on_signals() as stop:
@@ -65,9 +66,10 @@ def run_all(config: Config, folder: Path, *, listen: str | None, given: bool) ->
         endpoint = reachable(own) if own else config.bus.endpoint
         bus = config.bus.model_copy(update={"endpoint": endpoint})
         config = config.model_copy(update={"bus": bus})
-        (folder / "endpoint").write_text(endpoint + "\n")
+        credentials = Path(bus.credentials).absolute() if bus.credentials else ""
+        (folder / "endpoint").write_text(f"{endpoint}\n{credentials}\n")
         _log_to(folder / "logs")
-        specs = child_specs(config, stored, folder, own)
+        specs = child_specs(config, stored, folder, own, insecure=insecure)
         environment = {k: v for k, v in os.environ.items() if not k.startswith(settings.ENV_PREFIX)}
         supervisor = Supervisor(specs, folder / "logs", environment, [lock])
         ending = supervise(config, supervisor, stop)
@@ -127,11 +129,14 @@ def _view(
     )
 
 
-def child_specs(config: Config, stored: Config, folder: Path, own: str | None) -> list[ChildSpec]:
+def child_specs(
+    config: Config, stored: Config, folder: Path, own: str | None, *, insecure: bool = False
+) -> list[ChildSpec]:
     """The processes of a run: our router if `own` tells where it listens, and all services."""
     specs = []
     if own is not None:
-        specs.append(_spec(ROUTER, "--listen", own))
+        secure = ("--credentials", config.bus.credentials) if config.bus.credentials else ()
+        specs.append(_spec(ROUTER, "--listen", own, *secure, *(["--insecure"] * insecure)))
     # What may differ from the stored configuration, such as the endpoint, goes along.
     changes = settings.differences(stored, config)
     options = [f"--set={key}={settings.toml_value(value)}" for key, _, value in changes]

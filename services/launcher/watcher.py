@@ -10,6 +10,7 @@ from typing import Self
 
 from services.monitor.halting import halt
 from services.monitor.heartbeats import Reader, Snapshot
+from services.security.use import using
 from shared.bus import Bus
 from shared.config import Config
 from shared.errors import RouterMissing
@@ -35,7 +36,7 @@ class Watcher:
     """
 
     def __init__(self, config: Config) -> None:
-        self._config = config
+        self._config = using(config, "operator", "watcher")
         self._done = threading.Event()
         self._bus: Bus | None = None
         self.sight = Sight()

@@ -56,7 +56,7 @@ def _doing(bus: Bus, name: str, config: Config) -> str:
     """Ping the service and wait for its heartbeat. Raises BusError when it does not answer."""
     ident = BY_NAME[name].ident(config.robot.id)
     inbox = bus.inbox()
-    reader = Reader(inbox)
+    reader = Reader(inbox, robot=ident if name == DRIVER.name else "*")
     bus.request(PING, Ping(), ServiceReply, ident=f"{name}-{ident}")
     deadline_s = time.monotonic() + PERIODS * config.bus.heartbeat_s
     while time.monotonic() < deadline_s:

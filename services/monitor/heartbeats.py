@@ -55,13 +55,17 @@ class Source(Protocol):
 class Reader:
     """Gathers heartbeats from an inbox. `update` often; `snapshot` when something is shown."""
 
-    def __init__(self, inbox: Source, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, inbox: Source, clock: Callable[[], float] = time.monotonic, robot: str = "*"
+    ) -> None:
+        """Listen to all robots, or to one: a driver's credentials allow no more."""
         self._inbox, self._clock = inbox, clock
         self._robots: dict[str, tuple[RobotState, float]] = {}
         self._actors: dict[str, tuple[ActorState, float]] = {}
         self._replay: tuple[ReplayState, float] | None = None
         self._learner: tuple[LearnerState, float] | None = None
-        for stream in (ROBOT_STATE, ACTOR_STATE, REPLAY_STATE, LEARNER_STATE):
+        inbox.subscribe(ROBOT_STATE, robot)
+        for stream in (ACTOR_STATE, REPLAY_STATE, LEARNER_STATE):
             inbox.subscribe(stream)
 
     def update(self) -> None:

@@ -2,7 +2,7 @@
 
 A run folder is in use while `corridor up` holds the lock on its `lock` file; the kernel lets go of
 the lock when the process ends, however it ends. Beside it, the file `endpoint` tells where the
-router of that run listens.
+router of that run listens and, in its second line, which folder of credentials it uses.
 """
 
 from __future__ import annotations
@@ -79,6 +79,7 @@ def reach(
     run: str | None = None,
     endpoint: str | None = None,
     env: Mapping[str, str] | None = None,
+    credentials: str | None = None,
 ) -> Config:
     """The configuration by which a running run is reached from outside.
 
@@ -88,7 +89,7 @@ def reach(
     Raises:
         ConfigError: several runs are up and none was chosen.
     """
-    chosen = {"run.name": run, "bus.endpoint": endpoint}
+    chosen = {"run.name": run, "bus.endpoint": endpoint, "bus.credentials": credentials}
     overrides = [f"{key}={settings.toml_value(v)}" for key, v in chosen.items() if v is not None]
     plain = settings.load(overrides=overrides, env=env)
     if endpoint is not None or "CORRIDOR_BUS__ENDPOINT" in (env or {}):
@@ -106,14 +107,16 @@ def reach(
 
 
 def _of_folder(folder: Path, overrides: list[str]) -> Config:
-    """The stored configuration with the endpoint the run uses now."""
+    """The stored configuration with the endpoint and the credentials the run uses now."""
     stored = settings.read_folder(folder)
-    now = stored.bus.endpoint
+    now = [stored.bus.endpoint, stored.bus.credentials]
     with suppress(FileNotFoundError):
         # Left behind by a killed supervisor it means nothing.
         if is_up(folder):
-            now = (folder / "endpoint").read_text().strip()
-    overrides = [f"bus.endpoint={settings.toml_value(now)}", *overrides]
+            now = [*(folder / "endpoint").read_text().splitlines(), ""][:2]
+    keys = ("bus.endpoint", "bus.credentials")
+    used = [f"{key}={settings.toml_value(value)}" for key, value in zip(keys, now, strict=True)]
+    overrides = [*used, *overrides]
     return settings.load(file=folder / settings.FILE_NAME, overrides=overrides)
 
 

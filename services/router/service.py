@@ -10,22 +10,34 @@ import logging
 import signal
 import threading
 from collections.abc import Callable
+from pathlib import Path
 
+from services.security.use import refuse_open_door
 from shared.bus import open_router
 
 log = logging.getLogger(__name__)
 
 
-def run(endpoint: str, announce: Callable[[str], None]) -> None:
+def run(
+    endpoint: str,
+    announce: Callable[[str], None],
+    credentials: str = "",
+    *,
+    insecure: bool = False,
+) -> None:
     """Route until SIGTERM or SIGINT.
 
     Args:
         endpoint: where to listen; port 0 takes a free one.
         announce: called once with the locator that clients connect to.
+        credentials: folder of the router, with its configuration; empty: open to everybody.
+        insecure: whether it may then be reached from other machines.
 
     Raises:
-        ConfigError: it cannot listen there.
+        ConfigError: it cannot or must not listen there.
     """
+    refuse_open_door(endpoint, credentials, insecure)
+    file = Path(credentials) / "router.json5" if credentials else None
     stop = threading.Event()
 
     def on_signal(*_: object) -> None:
@@ -33,7 +45,7 @@ def run(endpoint: str, announce: Callable[[str], None]) -> None:
 
     signal.signal(signal.SIGTERM, on_signal)
     signal.signal(signal.SIGINT, on_signal)
-    with open_router(endpoint) as locator:
+    with open_router(endpoint, file) as locator:
         log.info("router listens on %s", locator)
         announce(locator)
         stop.wait()

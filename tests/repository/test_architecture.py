@@ -61,6 +61,10 @@ def test_one_file_imports_httpx() -> None:
     assert users("httpx") == {"services/robot_driver/real/robotino.py"}
 
 
+def test_one_file_imports_cryptography() -> None:
+    assert users("cryptography") == {"services/security/authority.py"}
+
+
 def test_one_file_imports_lmdb() -> None:
     assert users("lmdb") == {"services/replay/tables.py"}
 

@@ -21,11 +21,13 @@ from builders import LIFE, make_episode
 from fakes import fake_service, message
 
 from services import processes
+from services.cli.main import main
 from services.monitor import health
 from services.processes import DRIVER, PROCESSES
 from services.replay.storage import Storage
+from services.security.authority import Authority
 from shared import settings
-from shared.bus import Bus, zenoh_config
+from shared.bus import Bus
 from shared.config import BusConfig, Config, RunConfig
 from shared.keys import ACTOR_STATE, LEARNER_STATE, REPLAY_STATE, ROBOT_STATE, Stream
 from shared.messages import ActorState, LearnerState, Message, ReplayState, RobotState
@@ -49,10 +51,12 @@ FOREIGN = {
     "safetensors": "safetensors",
     "lmdb": "lmdb",
     "tensorboard": "tensorboard",
+    "cryptography": "cryptography",
 }
 """Distributions that not every image holds, and what they are imported as."""
 MODULES = {
-    "router": "services.router.service, services.monitor.health, services.monitor.status",
+    "router": "services.router.service, services.monitor.health, services.monitor.status, "
+    "services.security.router_file",
     "driver-sim": "services.robot_driver.service, services.robot_driver.simulated.sim, "
     "services.monitor.health",
     "driver-robotino": "services.robot_driver.service, services.robot_driver.real.hardware, "
@@ -140,7 +144,7 @@ def test_there_is_one_image_for_each_process_with_what_it_needs() -> None:
 
 
 def test_images_are_small_where_they_can_be() -> None:
-    assert distributions(extras("router")) == set()
+    assert distributions(extras("router")) == {"cryptography"}
     for kind in ("robotino", "ros2"):
         held = distributions(extras(DRIVERS[kind]))
         assert held & {"torch", "pybullet", "opencv-python-headless", "openvino"} == set()
@@ -192,14 +196,17 @@ def test_the_image_context_holds_what_is_copied() -> None:
 
 def test_compose_runs_every_service_with_restart_policy_and_health_check() -> None:
     tree = compose("docker-compose.yml")
-    assert set(tree["services"]) == {"router", *SERVICES}
+    assert set(tree["services"]) == {"router", "credentials", "operator", *SERVICES}
     for name in SERVICES:
         service = tree["services"][name]
         assert service["build"]["target"] == name
         assert service["image"] == f"corridor-{name}"
         assert service["command"][0] == role(name)
         assert service["restart"] == "on-failure"
-        assert service["depends_on"] == ["router"]
+        assert service["depends_on"] == {
+            "credentials": {"condition": "service_completed_successfully"},
+            "router": {"condition": "service_started"},
+        }
         check = json.dumps(service["healthcheck"]["test"][1:])
         assert f"CMD {check}" in stages()[name][1]
     assert tree["services"]["router"]["restart"] == "unless-stopped"
@@ -219,13 +226,17 @@ def test_containers_may_do_nothing_but_their_work() -> None:
 def test_state_lies_in_named_volumes() -> None:
     tree = compose("docker-compose.yml")
     for name in SERVICES:
-        assert tree["services"][name]["volumes"] == [f"{role(name)}:/data"]
+        assert tree["services"][name]["volumes"] == [
+            f"{role(name)}:/data",
+            f"{role(name)}-credentials:/credentials:ro",
+        ]
         assert role(name) in tree["volumes"]
 
 
 def test_a_profile_chooses_the_driver() -> None:
     services = compose("docker-compose.yml")["services"]
     chosen = {n: s["profiles"] for n, s in services.items() if "profiles" in s}
+    assert chosen.pop("operator") == ["tools"]
     assert chosen == {name: [profile] for profile, name in DRIVERS.items()}
     assert example()["COMPOSE_PROFILES"] in DRIVERS
 
@@ -236,18 +247,34 @@ def test_the_router_is_zenohd_of_the_version_of_its_clients() -> None:
     assert version is not None
     router = compose("docker-compose.yml")["services"]["router"]
     assert router["image"] == f"eclipse/zenoh:{version[1]}"
-    assert router["volumes"] == ["./deploy/router.json5:/etc/corridor/router.json5:ro"]
-    assert router["command"] == ["--config", "/etc/corridor/router.json5"]
+    assert router["volumes"] == ["router-credentials:/credentials:ro"]
+    assert router["command"] == ["--config", "/credentials/router.json5"]
 
 
-def test_zenohd_is_set_up_like_our_own_router() -> None:
-    theirs = zenoh.Config.from_file(str(ROOT / "deploy/router.json5"))
-    ours = zenoh_config("router", listen=["tcp/0.0.0.0:7447"], shared_memory=False)
-    for key in (
-        *("mode", "listen/endpoints", "connect/endpoints", "connect/timeout_ms", "connect/retry"),
-        *("scouting", "transport", "adminspace"),
-    ):
-        assert json.loads(theirs.get_json(key)) == json.loads(ours.get_json(key)), key
+def test_the_first_up_makes_credentials_and_each_container_sees_its_own(tmp_path: Path) -> None:
+    tree = compose("docker-compose.yml", {"CORRIDOR_ROBOT__ID": "r7", "ROUTER_HOST": "lab.example"})
+    maker, made = tree["services"]["credentials"], tmp_path / "volumes"
+    assert maker["image"] == tree["services"]["operator"]["image"] == "corridor-router"
+    places = dict(volume.split(":") for volume in maker["volumes"])
+    assert {path for path in places.values() if path != "/credentials"} == set(
+        re.findall(r"/deliver/\w+", stages()["router"][1])
+    )
+    for path in places.values():  # as the image has them
+        (made / path[1:]).mkdir(parents=True)
+    assert main([word.replace("/", f"{made}/", 1) for word in maker["command"]]) == 0
+    for name, service in tree["services"].items():
+        volumes = [volume.split(":") for volume in service.get("volumes", [])]
+        seen = [volume for volume, path, *_ in volumes if path == "/credentials"]
+        if name == "credentials":
+            continue
+        assert [mode for _, path, *mode in volumes if path == "/credentials"] == [["ro"]]
+        files = {path.name for path in (made / places[seen[0]][1:]).iterdir()}
+        more = {"router.json5"} if name == "router" else set()
+        assert files == {"key.pem", "cert.pem", "ca.pem", *more}, name
+    zenohd = zenoh.Config.from_file(str(made / "deliver/router/router.json5"))
+    assert json.loads(zenohd.get_json("listen/endpoints")) == ["tls/0.0.0.0:7447"]
+    assert {"lab.example", "router"} < set(Authority(made / "credentials").hosts)
+    assert "driver-r7" in Authority(made / "credentials").credentials
 
 
 def test_our_own_router_needs_no_other_image() -> None:
@@ -255,6 +282,7 @@ def test_our_own_router_needs_no_other_image() -> None:
     assert router["image"] == "corridor-router"
     assert router["build"]["target"] == "router"
     assert router["command"][0] == "router"
+    assert router["environment"] == {"CORRIDOR_CREDENTIALS": "/credentials"}
     check = json.dumps(router["healthcheck"]["test"][1:])
     assert f"CMD {check}" in stages()["router"][1]
 
@@ -272,7 +300,8 @@ def test_all_services_get_the_same_valid_configuration(
             more = compose("docker-compose.gpu.yml")["services"][service]["environment"]
             environment.update(more)
         config = settings.load(preset=tree["command"][2], env=environment)
-        assert config.bus.endpoint == "tcp/router:7447"
+        assert config.bus.endpoint == "tls/router:7447"
+        assert config.bus.credentials == "/credentials"
         assert config.numerics.learner.device == ("cuda" if gpu else "auto")
         found.add(config.fingerprint())
     assert len(found) == 1

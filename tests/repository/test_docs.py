@@ -99,7 +99,8 @@ def test_settings_named_exist(page: Path) -> None:
         for key in re.findall(r"--set ([\w.]+)=", text):
             assert key in keys, key
         for name in re.findall(r"CORRIDOR_([A-Z0-9_]+)", text):
-            assert name.lower().replace("__", ".") in keys | {"section.key"}, name
+            known = keys | settings.SHORT.keys() | {"section.key"}
+            assert name.lower().replace("__", ".") in known, name
         named = re.fullmatch(r"([a-z_]+(?:\.[a-z_]+)+)(?: = \S+)?", text)
         if (
             named

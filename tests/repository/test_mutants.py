@@ -27,6 +27,7 @@ PACKAGES = (
     "services/launcher",
     "services/recorder",
     "services/router",
+    "services/security",
     "services/cli",
     "experiments/plans",
     "experiments/runs",

@@ -185,6 +185,19 @@ def test_children_get_the_stored_file_and_what_differs_from_it(tmp_path: Path) -
         assert "--tethered" in command
 
 
+def test_children_get_the_credentials_and_the_router_what_it_may(tmp_path: Path) -> None:
+    stored = settings.load("demo")
+    config = settings.load("demo", overrides=["bus.credentials=/secure"])
+    specs = {s.name: s for s in child_specs(config, stored, tmp_path, "tcp/127.0.0.1:8")}
+    router = specs["router"].command
+    assert router[router.index("--credentials") + 1] == "/secure"
+    assert "--insecure" not in router
+    assert '--set=bus.credentials="/secure"' in specs["actor"].command
+    specs = {s.name: s for s in child_specs(stored, stored, tmp_path, "tcp/0:8", insecure=True)}
+    assert "--insecure" in specs["router"].command
+    assert "--credentials" not in specs["router"].command
+
+
 def test_a_given_endpoint_means_no_own_router(tmp_path: Path) -> None:
     names = [spec.name for spec in child_specs(Config(), Config(), tmp_path, None)]
     assert names == ["replay", "learner", "actor", "driver"]
@@ -222,6 +235,14 @@ def test_the_only_run_that_is_up_is_found() -> None:
         assert (found.run.name, found.bus.endpoint) == ("one", "tcp/127.0.0.1:5001")
     assert not is_up(folder)
     assert reach().run.name == "demo"
+
+
+def test_a_run_is_reached_with_the_credentials_it_uses_now() -> None:
+    with locked(make_up("one", "tcp/127.0.0.1:5001\n/secure")):
+        assert reach().bus.credentials == "/secure"
+        assert reach(credentials="/mine").bus.credentials == "/mine"
+    with locked(make_up("one", "tcp/127.0.0.1:5001")):
+        assert reach().bus.credentials == ""
 
 
 def test_of_several_runs_one_must_be_chosen() -> None:
