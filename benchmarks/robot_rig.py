@@ -19,11 +19,11 @@ from typing import Any, Self
 import httpx
 
 from benchmarks.waiting import wait_until
-from services.monitor.halting import RobotOrder, order
 from shared import settings
 from shared.bus import Bus
 from shared.config import Config
 from shared.errors import PeerMissing, RouterMissing
+from shared.halting import RobotOrder, order
 from shared.keys import ROBOT_STATE
 from shared.messages import RobotState
 from shared.provenance import ROOT

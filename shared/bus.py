@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -26,61 +26,11 @@ from shared.errors import (
 from shared.inbox import Inbox
 from shared.keys import CLAIM_PATTERN, Peer, Stream, alive_key, check_sender, ident_in, parse_alive
 from shared.messages import Message, Refusal
+from shared.zenoh_settings import encrypted, zenoh_config
 
 M = TypeVar("M", bound=Message)
 REPLY_LIMIT = 16 * 1024 * 1024
 """Bytes of one reply; larger ones are refused."""
-
-
-def zenoh_config(
-    mode: str,
-    *,
-    connect: Sequence[str] = (),
-    listen: Sequence[str] = (),
-    lease_ms: int = 2000,
-    shared_memory: bool = True,
-    credentials: str = "",
-) -> zenoh.Config:
-    """A closed configuration: no scouting, explicit endpoints, quick reconnection.
-
-    With a folder of credentials a client encrypts everything and says who it is.
-    """
-    config = zenoh.Config()
-    for key, value in {
-        "mode": mode,
-        "connect/endpoints": [encrypted(end) if credentials else end for end in connect],
-        "listen/endpoints": list(listen),
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "scouting/delay": 0,
-        "connect/timeout_ms": 1000,
-        "connect/retry": {
-            "period_init_ms": 50,
-            "period_max_ms": 300,
-            "period_increase_factor": 1.5,
-        },
-        "transport/link/tx/lease": lease_ms,
-        # It would go around encryption.
-        "transport/shared_memory/enabled": shared_memory and not credentials,
-        "adminspace/enabled": mode == "router",
-        **({"transport/link/tls": _tls(credentials)} if credentials else {}),
-    }.items():
-        config.insert_json5(key, json.dumps(value))
-    return config
-
-
-def _tls(credentials: str) -> dict[str, object]:
-    return {
-        "root_ca_certificate": f"{credentials}/ca.pem",
-        "connect_private_key": f"{credentials}/key.pem",
-        "connect_certificate": f"{credentials}/cert.pem",
-        "enable_mtls": True,
-    }
-
-
-def encrypted(endpoint: str) -> str:
-    """The same endpoint with TLS."""
-    return re.sub("^tcp/", "tls/", endpoint)
 
 
 class Request:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from shared.facts import IMAGE_HEIGHT, IMAGE_WIDTH, NAME
+from shared.facts import DEFAULT_ENDPOINT, DEFAULT_RUN, IMAGE_HEIGHT, IMAGE_WIDTH, NAME
 from shared.rl.retention.table import STRATEGIES
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class Section(BaseModel):
 class RunConfig(Section):
     """Which run this is."""
 
-    name: Name = "demo"
+    name: Name = DEFAULT_RUN
     """First part of every Zenoh key, so that two runs never mix."""
     seed: int = Field(default=1, ge=0, lt=2**63)
     """The only seed. Every random number is a function of it, a role and a position."""
@@ -56,7 +56,7 @@ class RunConfig(Section):
 class BusConfig(Section):
     """How services reach the Zenoh router."""
 
-    endpoint: str = Field(default="tcp/127.0.0.1:7447", pattern=r"^[a-z][a-z0-9-]*/\S+$")
+    endpoint: str = Field(default=DEFAULT_ENDPOINT, pattern=r"^[a-z][a-z0-9-]*/\S+$")
     """Where clients connect, and where our own router listens."""
     credentials: str = ""
     """Folder with `key.pem`, `cert.pem` and `ca.pem`, or one that `corridor secure init` made;
@@ -137,7 +137,7 @@ class Ros2Config(Section):
     """A ROS 2 robot over Zenoh: through zenoh-bridge-ros2dds, or natively through rmw_zenoh."""
 
     endpoint: str = Field(
-        default="tcp/127.0.0.1:7447", pattern=r"^(tcp|udp|tls|quic)/[^\s/]+:[0-9]{1,5}$"
+        default=DEFAULT_ENDPOINT, pattern=r"^(tcp|udp|tls|quic)/[^\s/]+:[0-9]{1,5}$"
     )
     """The bridge, or the router of rmw_zenoh, on the robot."""
     transport: Literal["bridge", "rmw-zenoh"] = "bridge"

@@ -43,5 +43,7 @@ FORWARD, FORWARD_LEFT, FORWARD_RIGHT = (SHORT_NAMES.index(s) for s in ("forward"
 MIRRORED = tuple(SHORT_NAMES.index(action.mirror) for action in ACTIONS)
 """Number of each action as it looks in a mirror."""
 
+DEFAULT_RUN, DEFAULT_ENDPOINT = "demo", "tcp/127.0.0.1:7447"
+"""Name of a run, and where its router is, if nobody says otherwise."""
 NAME = re.compile(r"^[a-z0-9][a-z0-9_-]{0,40}$")
 """What runs, robots, worlds and obstacles may be called: safe in keys and in file names."""

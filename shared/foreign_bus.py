@@ -18,8 +18,9 @@ from typing import Any, Literal
 
 import zenoh
 
-from shared.bus import locator, zenoh_config
+from shared.bus import locator
 from shared.errors import ConfigError, RouterMissing
+from shared.zenoh_settings import zenoh_config
 
 MAX_TOKENS = 4096
 """Liveliness tokens an inbox remembers; more are refused and counted."""

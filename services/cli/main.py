@@ -41,10 +41,13 @@ app.add_typer(emulate, name="emulate")
 app.add_typer(secure, name="secure")
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; every expected failure becomes one line and an exit code."""
+def main(arguments: Sequence[str] | None = None, *, first_halt: int | None = None) -> int:
+    """Run the command line; every expected failure becomes one line and an exit code.
+
+    first_halt: the number of an emergency stop that was sent already (`first_stop`).
+    """
     try:
-        code = app(arguments, prog_name="corridor", standalone_mode=False)
+        code = app(arguments, prog_name="corridor", standalone_mode=False, obj=first_halt)
     except ConfigError as error:
         return _fail(str(error), EXIT_CONFIG)
     except StateError as error:

@@ -24,7 +24,7 @@ from services.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from services.monitor.halting import RobotOrder
+    from shared.halting import RobotOrder
 
 GivenRouterOption = Annotated[
     str | None,
@@ -130,6 +130,7 @@ def _add_order(app: typer.Typer, name: RobotOrder, text: str) -> None:
     """Add a command that robots acknowledge."""
 
     def command(
+        context: typer.Context,
         run: RunOption = None,
         run_dir: RunDirOption = None,
         endpoint: EndpointOption = None,
@@ -138,7 +139,9 @@ def _add_order(app: typer.Typer, name: RobotOrder, text: str) -> None:
     ) -> None:
         from services.monitor.operator import command_robots
 
-        raise typer.Exit(command_robots(reach(run, run_dir, endpoint, credentials), name, robot))
+        there = reach(run, run_dir, endpoint, credentials)
+
+        raise typer.Exit(command_robots(there, name, robot, context.obj))
 
     app.command(name, help=text)(command)
 

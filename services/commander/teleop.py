@@ -17,9 +17,9 @@ from contextlib import contextmanager, suppress
 
 from services.commander.commander import Commander, commanding
 from services.commander.keyboard import KeyParser, Wish
-from services.monitor.halting import halt
 from shared.config import Config
 from shared.errors import ConfigError, PeerMissing
+from shared.halting import halt
 from shared.messages import Motion, Observation
 
 POLL_S = 0.02

@@ -8,12 +8,12 @@ import time
 from dataclasses import dataclass, field
 from typing import Self
 
-from services.monitor.halting import halt
 from services.monitor.heartbeats import Reader, Snapshot
 from services.security.use import using
 from shared.bus import Bus
 from shared.config import Config
 from shared.errors import RouterMissing
+from shared.halting import halt
 from shared.halts import ALL
 
 log = logging.getLogger(__name__)

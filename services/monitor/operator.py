@@ -12,13 +12,13 @@ from typing import Any, TypeVar
 import typer
 from pydantic import ValidationError
 
-from services.monitor.halting import RobotOrder, order
 from services.processes import DRIVER, SERVICES
 from shared.bus import Bus
 from shared.codec import first_problem
 from shared.config import Config
 from shared.errors import BadMessage, BusError, ConfigError, PeerMissing
 from shared.facts import NAME
+from shared.halting import RobotOrder, order
 from shared.halts import ALL
 from shared.keys import ROBOT_WORLD, STOP, Peer, Stream
 from shared.messages import (
@@ -38,10 +38,12 @@ ATTEMPTS, ATTEMPT_S = 3, 1.0
 GONE_WITHIN_S = 10.0
 
 
-def command_robots(config: Config, name: RobotOrder, robot: str | None) -> int:
+def command_robots(
+    config: Config, name: RobotOrder, robot: str | None, number: int | None = None
+) -> int:
     """Halt one robot or all of the run, or release them; print what each answers.
 
-    A halt goes on until all stand, or until Ctrl-C.
+    A halt goes on until all stand, or until Ctrl-C. number: that of a halt that was sent before.
 
     Returns:
         0, or 1 if a robot did not answer.
@@ -53,7 +55,11 @@ def command_robots(config: Config, name: RobotOrder, robot: str | None) -> int:
     """
     _check_name(robot)
     with Bus(config.bus, config.run.name) as bus, interruptible() as ended:
-        return 0 if order(bus, name, robot or ALL, typer.echo, ended=ended.is_set) else 1
+        return (
+            0
+            if order(bus, name, robot or ALL, typer.echo, number=number, ended=ended.is_set)
+            else 1
+        )
 
 
 @contextmanager

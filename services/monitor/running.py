@@ -1,9 +1,4 @@
-"""Which runs are up on this machine, and how to reach a run.
-
-A run folder is in use while `corridor up` holds the lock on its `lock` file; the kernel lets go of
-the lock when the process ends, however it ends. Beside it, the file `endpoint` tells where the
-router of that run listens and, in its second line, which folder of credentials it uses.
-"""
+"""Holding the folder of a run that is up (`shared.place`), and how to reach a run."""
 
 from __future__ import annotations
 
@@ -11,14 +6,14 @@ import fcntl
 import os
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from shared import settings
 from shared.config import Config
 from shared.errors import ConfigError
+from shared.place import those_up, try_lock, used
 
-RUNS = Path("runs")
 LOOKING_S, ORPHANS_S = 1.0, 6.0
 """How long a taken lock is waited for while its owner lives, and after its death."""
 
@@ -35,7 +30,7 @@ def locked(folder: Path) -> Iterator[int]:
     """
     start_s = time.monotonic()
     with (folder / "lock").open("a+") as stream:
-        while not _try_lock(stream.fileno(), fcntl.LOCK_EX):
+        while not try_lock(stream.fileno(), fcntl.LOCK_EX):
             stream.seek(0)
             owner = stream.read().strip()
             # Others may look at the lock for an instant, and orphans need a moment to end.
@@ -65,15 +60,6 @@ def _is_process(pid: str) -> bool:
     return True
 
 
-def is_up(folder: Path) -> bool:
-    """Whether a `corridor up` holds this run folder now."""
-    try:
-        with (folder / "lock").open() as stream:
-            return not _try_lock(stream.fileno(), fcntl.LOCK_SH)
-    except OSError:
-        return False
-
-
 def reach(
     run_dir: Path | None = None,
     run: str | None = None,
@@ -96,7 +82,7 @@ def reach(
         return plain
     if run_dir is not None:
         return _of_folder(run_dir, overrides)
-    up = [folder for folder in sorted(RUNS.glob("*")) if is_up(folder)]
+    up = those_up()
     if run is not None:
         up = [folder for folder in up if settings.read_folder(folder).run.name == run]
     if len(up) > 1:
@@ -109,20 +95,8 @@ def reach(
 def _of_folder(folder: Path, overrides: list[str]) -> Config:
     """The stored configuration with the endpoint and the credentials the run uses now."""
     stored = settings.read_folder(folder)
-    now = [stored.bus.endpoint, stored.bus.credentials]
-    with suppress(FileNotFoundError):
-        # Left behind by a killed supervisor it means nothing.
-        if is_up(folder):
-            now = [*(folder / "endpoint").read_text().splitlines(), ""][:2]
+    now = used(folder) or (stored.bus.endpoint, stored.bus.credentials)
     keys = ("bus.endpoint", "bus.credentials")
-    used = [f"{key}={settings.toml_value(value)}" for key, value in zip(keys, now, strict=True)]
-    overrides = [*used, *overrides]
+    there = [f"{key}={settings.toml_value(value)}" for key, value in zip(keys, now, strict=True)]
+    overrides = [*there, *overrides]
     return settings.load(file=folder / settings.FILE_NAME, overrides=overrides)
-
-
-def _try_lock(descriptor: int, kind: int) -> bool:
-    try:
-        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from services.security.authority import ROUTER, Authority, write_private
 from services.security.rules import access_control, size_limits
-from shared.bus import zenoh_config
 from shared.keys import MIB
+from shared.zenoh_settings import zenoh_config
 
 FILE = "router.json5"
 LISTEN = "tls/0.0.0.0:7447"

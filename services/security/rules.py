@@ -16,12 +16,12 @@ from typing import Any, Literal
 
 from services.security.kinds import ANY, KINDS, Credential, Kind
 from shared.bus import REPLY_LIMIT
-from shared.keys import ALIVE_PATTERN, STREAMS, Role, Stream
+from shared.keys import ALIVE_PATTERN, CLAIM_PATTERN, STREAMS, Role, Stream
 
 Action = Literal[
     "publish", "subscribe", "ask", "answer", "token", "look", "see subscribers", "see queryables"
 ]
-TOKENS = (ALIVE_PATTERN, "{run}/claim/{service}/{id}/{life}")
+TOKENS = (ALIVE_PATTERN, CLAIM_PATTERN)
 """Liveliness tokens: a service declares those of its own names, and everybody may look."""
 
 FLOWS: dict[Action, tuple[tuple[str, str], ...]] = {

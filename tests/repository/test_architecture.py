@@ -38,9 +38,14 @@ def users(package: str) -> set[str]:
     return {file for file, name in imports() if name == package}
 
 
-def test_zenoh_is_imported_by_our_bus_and_by_that_to_foreign_networks() -> None:
+def test_zenoh_is_imported_by_our_buses_and_by_the_first_stop_alone() -> None:
     """Two sessions with nothing in common but the library: see the head of each."""
-    assert users("zenoh") == {"shared/bus.py", "shared/foreign_bus.py"}
+    assert users("zenoh") == {
+        "shared/bus.py",
+        "shared/foreign_bus.py",
+        "shared/zenoh_settings.py",
+        "services/cli/first_stop.py",
+    }
     assert importers("shared.foreign_bus") == {
         "services/robot_driver/real/ros2.py",
         "services/robot_driver/emulation/ros2.py",

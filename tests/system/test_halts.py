@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from cluster import ALL, Cluster, make_config
 
-from services.monitor.halting import order
 from shared.errors import PeerMissing
+from shared.halting import order
 from shared.inbox import Inbox
 from shared.keys import HALT, OBSERVATION, RELEASE
 from shared.messages import Deadline, Halts, Observation, Release, Standing

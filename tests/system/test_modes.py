@@ -9,8 +9,8 @@ import pytest
 from cluster import ALL, Cluster, make_config
 
 from benchmarks.waiting import wait_until
-from services.monitor.halting import RobotOrder, order
 from services.replay.storage import Storage
+from shared.halting import RobotOrder, order
 from shared.keys import ACTOR_STATE, OBSERVATION, ROBOT_STATE
 from shared.messages import ActorState, Observation, RobotState
 

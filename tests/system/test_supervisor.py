@@ -16,8 +16,9 @@ from terminals import full_pipe
 
 from benchmarks.waiting import wait_until
 from services.launcher.supervisor import ChildSpec, ChildStatus, Ending, Supervisor
-from services.monitor.running import is_up, locked
+from services.monitor.running import locked
 from shared.errors import ConfigError
+from shared.place import is_up
 
 pytestmark = pytest.mark.system
 

@@ -13,10 +13,11 @@ import pytest
 from services.cli import main as cli
 from services.cli.options import import_installed
 from services.launcher.up import PORTS, child_specs, free_endpoint, reachable, run_all
-from services.monitor.running import is_up, locked, reach
+from services.monitor.running import locked, reach
 from shared import settings
 from shared.config import BusConfig, Config
 from shared.errors import ConfigError, StateError
+from shared.place import is_up
 from shared.service import guarded
 
 COMMANDS = [

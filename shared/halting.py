@@ -11,11 +11,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
-from services.processes import DRIVER
 from shared.bus import Bus
 from shared.errors import PeerMissing
 from shared.halts import ALL, RELEASE_WITHIN_S, new_halt
-from shared.keys import HALT, RELEASE
+from shared.keys import HALT, RELEASE, Role
 from shared.messages import (
     MAX_HALTS,
     Deadline,
@@ -30,6 +29,7 @@ REPEAT_S = 0.3
 """A halt that is not confirmed is sent again after this time."""
 NOBODY_S = 3.0
 """Without any robot, the search for one ends after this time."""
+DRIVER: Role = "driver"
 Echo = Callable[[str], None]
 RobotOrder = Literal["estop", "clear", "pause", "resume"]
 
@@ -40,6 +40,7 @@ def order(
     robot: str,
     echo: Echo,
     *,
+    number: int | None = None,
     ended: Callable[[], bool] = lambda: False,
 ) -> bool:
     """Carry out an operator's order; return whether every robot that is meant obeys.
@@ -48,7 +49,7 @@ def order(
     """
     kind: HaltKind = "estop" if name in ("estop", "clear") else "pause"
     if name in ("estop", "pause"):
-        return halt(bus, kind, robot, echo, ended=ended)
+        return halt(bus, kind, robot, echo, number=number, ended=ended)
     return release(bus, kind, robot, echo)
 
 
@@ -63,7 +64,7 @@ class Roll:
 
     def call(self, bus: Bus) -> None:
         """Note who is there now."""
-        for peer in bus.peers(DRIVER.name, self.robot or "*"):
+        for peer in bus.peers(DRIVER, self.robot or "*"):
             if peer.life not in self.done:
                 self.missing[peer.life] = peer.id
 
@@ -76,7 +77,7 @@ class Roll:
 
     def concerns(self, answer: Standing) -> bool:
         """Whether an answer is that of a driver that is meant."""
-        return answer.service == DRIVER.name and self.robot in (ALL, answer.id)
+        return answer.service == DRIVER and self.robot in (ALL, answer.id)
 
 
 def halt(

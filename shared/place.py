@@ -1,0 +1,50 @@
+"""Where a run is up on this machine, found with the standard library alone, so that it is quick.
+
+A run folder is in use while `corridor up` holds the lock on its `lock` file; the kernel lets go of
+the lock when the process ends, however it ends. Beside it, the file `endpoint` tells where the
+router of that run listens and, in its second line, which folder of credentials it uses.
+"""
+
+from __future__ import annotations
+
+import fcntl
+from pathlib import Path
+
+RUNS = Path("runs")
+
+
+def try_lock(descriptor: int, kind: int) -> bool:
+    """Take a lock (`fcntl.LOCK_SH` or `LOCK_EX`) if nobody is in the way; whether it was taken."""
+    try:
+        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def is_up(folder: Path) -> bool:
+    """Whether a `corridor up` holds this run folder now."""
+    try:
+        with (folder / "lock").open() as stream:
+            return not try_lock(stream.fileno(), fcntl.LOCK_SH)
+    except OSError:
+        return False
+
+
+def those_up() -> list[Path]:
+    """The run folders below `runs/` that are up."""
+    return [folder for folder in sorted(RUNS.glob("*")) if is_up(folder)]
+
+
+def used(folder: Path) -> tuple[str, str] | None:
+    """Endpoint and credentials that a run uses now; None: it is not up.
+
+    What a killed supervisor left behind means nothing.
+    """
+    if not is_up(folder):
+        return None
+    try:
+        lines = [*(folder / "endpoint").read_text().splitlines(), "", ""]
+    except FileNotFoundError:
+        return None
+    return lines[0], lines[1]
