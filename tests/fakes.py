@@ -14,7 +14,7 @@ from shared.keys import SERVICE, Stream
 from shared.messages import Message, ServiceReply
 
 M = TypeVar("M", bound=Message)
-TEXTS = {"life": "0" * 12, "hash": "0" * 16, "config": "0" * 16}
+TEXTS = {"life": "0" * 12, "hash": "0" * 16, "config": "0" * 16, "lineage": "0" * 16}
 
 
 def message(cls: type[M], **given: Any) -> M:
