@@ -265,7 +265,7 @@ def test_fields_may_come_in_any_order_and_defaults_may_be_left_out() -> None:
 
 
 def test_one_of_several_types_is_told_by_its_name() -> None:
-    end = m.FeedEnd(change=1, rows=2, messages=3)
+    end = m.FeedEnd(change=1, rows=2, messages=3, lineage="0" * 16)
     assert decode(encode(end), m.Change, m.FeedEnd) == end
     with pytest.raises(BadMessage, match="Change or FeedEnd"):
         decode(encode(m.WeightsRequest()), m.Change, m.FeedEnd)
@@ -343,7 +343,7 @@ def test_deep_nesting_is_refused_wherever_it_hides(depth: int, place: str) -> No
 
 
 @pytest.mark.parametrize(
-    "version", [0, 2, -1, None, "1", b"1", True, 1.0, (1,), 2**63, "x" * 100_000]
+    "version", [0, 2, -1, None, "1", b"1", True, 1.0, (1,), 2**63, "x" * 4096]
 )
 def test_another_protocol_version_is_refused(version: Any) -> None:
     text = refused({**fields_of(m.WeightsRequest()), "v": version}, m.WeightsRequest)
@@ -357,7 +357,7 @@ def test_a_message_without_version_or_type_is_refused() -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["Action", "Message", "", "observation", None, 5, ("a",), "x" * 1_000_000, "a\nb", "__v"],
+    ["Action", "Message", "", "observation", None, 5, ("a",), "x" * 4096, "a\nb", "__v"],
 )
 def test_another_type_is_refused(name: Any) -> None:
     assert "got type" in refused({**fields_of(make_observation(1)), "t": name}, m.Observation)
@@ -398,7 +398,8 @@ def test_a_value_of_another_type_is_refused_in_every_field(cls: type[m.Message])
             wrong += ["", "text", [1, 2]]
         for value in wrong:
             text = complaint(msgpack.packb({**fields, name: value}), cls)
-            free = accepted in ("<class 'str'>", "<class 'bytes'>") and not field.metadata
+            limits = limits_of(field.metadata).keys()
+            free = accepted in ("<class 'str'>", "<class 'bytes'>") and limits <= {"max_length"}
             assert name in text or (free and type(value).__name__ in accepted), (name, value)
 
 

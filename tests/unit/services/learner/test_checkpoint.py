@@ -56,7 +56,7 @@ def written(tmp_path: Path) -> tuple[Path, Trainer]:
 def test_a_restored_trainer_continues_bit_for_bit(written: tuple[Path, Trainer]) -> None:
     path, trainer = written
     resumed = make_trainer()
-    assert checkpoint.read(path, resumed, IDENTITY) == 3
+    assert checkpoint.read(path, resumed, IDENTITY).episode == 3
     assert state(resumed) == state(trainer)
     train(trainer, range(4, 7))
     train(resumed, range(4, 7))
@@ -67,7 +67,7 @@ def test_an_untrained_trainer_can_be_saved_too(tmp_path: Path) -> None:
     path, trainer = tmp_path / "checkpoint", make_trainer()
     checkpoint.write(path, trainer, 0, IDENTITY)
     resumed = make_trainer()
-    assert checkpoint.read(path, resumed, IDENTITY) == 0
+    assert checkpoint.read(path, resumed, IDENTITY).episode == 0
     train(trainer, range(1, 4))
     train(resumed, range(1, 4))
     assert state(resumed) == state(trainer)
@@ -76,7 +76,7 @@ def test_an_untrained_trainer_can_be_saved_too(tmp_path: Path) -> None:
 def test_without_a_file_the_trainer_stays_as_it_is(tmp_path: Path) -> None:
     trainer = make_trainer()
     before = state(trainer)
-    assert checkpoint.read(tmp_path / "none", trainer, IDENTITY) == 0
+    assert checkpoint.read(tmp_path / "none", trainer, IDENTITY).episode == 0
     assert state(trainer) == before
 
 
@@ -84,18 +84,18 @@ def test_the_newer_checkpoint_takes_the_place_of_the_older(written: tuple[Path, 
     path, trainer = written
     train(trainer, range(4, 5))
     checkpoint.write(path, trainer, 4, IDENTITY)
-    assert checkpoint.read(path, make_trainer(), IDENTITY) == 4
-    assert [p.name for p in path.parent.iterdir()] == [path.name]
+    assert checkpoint.read(path, make_trainer(), IDENTITY).episode == 4
+    assert sorted(p.name for p in path.parent.iterdir()) == [path.name, f"{path.name}.previous"]
 
 
 def test_a_half_written_newer_file_is_ignored(written: tuple[Path, Trainer]) -> None:
     path, trainer = written
     path.with_name(path.name + ".new").write_bytes(path.read_bytes()[:1000])
     resumed = make_trainer()
-    assert checkpoint.read(path, resumed, IDENTITY) == 3
+    assert checkpoint.read(path, resumed, IDENTITY).episode == 3
     assert state(resumed) == state(trainer)
     checkpoint.write(path, trainer, 4, IDENTITY)
-    assert checkpoint.read(path, make_trainer(), IDENTITY) == 4
+    assert checkpoint.read(path, make_trainer(), IDENTITY).episode == 4
 
 
 def test_a_checkpoint_of_another_run_is_refused(written: tuple[Path, Trainer]) -> None:
