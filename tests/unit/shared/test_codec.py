@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+import tracemalloc
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgpack
@@ -342,9 +343,7 @@ def test_deep_nesting_is_refused_wherever_it_hides(depth: int, place: str) -> No
 # ------------------------------------------------------------------------- version and type
 
 
-@pytest.mark.parametrize(
-    "version", [0, 2, -1, None, "1", b"1", True, 1.0, (1,), 2**63, "x" * 4096]
-)
+@pytest.mark.parametrize("version", [0, 2, -1, None, "1", b"1", True, 1.0, (1,), 2**63, "x" * 4096])
 def test_another_protocol_version_is_refused(version: Any) -> None:
     text = refused({**fields_of(m.WeightsRequest()), "v": version}, m.WeightsRequest)
     assert "of protocol 1" in text
@@ -567,3 +566,85 @@ def test_a_change_of_the_world_names_exactly_what_its_kind_needs(
     fields: dict[str, Any], complaint: str
 ) -> None:
     assert complaint in refused({"v": 1, "t": "WorldChange", **fields}, m.WorldChange)
+
+
+# ------------------------------------------------------------------------- what it may cost
+
+MIB = 1024 * 1024
+
+
+def nested(depth: int, width: int, inner: bytes) -> bytes:
+    """Arrays of `width` arrays, `depth` deep."""
+    return inner if not depth else array(width) + nested(depth - 1, width, inner) * width
+
+
+def array(length: int) -> bytes:
+    return b"\xdd" + length.to_bytes(4, "big")
+
+
+GREEDY = {
+    "empty maps": array(24 * MIB) + b"\x80" * (24 * MIB),
+    "empty arrays": array(24 * MIB) + b"\x90" * (24 * MIB),
+    "numbers": array(5 * MIB) + b"\xce\xff\xff\xff\xff" * (5 * MIB - 1),
+    "arrays of arrays": nested(3, 250, b"\x80"),
+    "as a field": b"\x82\xa1v\x01\xa1t" + nested(3, 250, b"\x90"),
+    "arrays announced inside arrays": array(2**31) * 900,
+    "a map of many": b"\xdf\x00\x40\x00\x00" + b"\xa1a\x80" * (4 * MIB),
+    "long names": b"\x81\xdb" + (20 * MIB).to_bytes(4, "big") + b"\xf0\x9f\x98\x80" * (5 * MIB),
+    "an extension": b"\x81\xa1v\xc9" + (20 * MIB).to_bytes(4, "big") + b"\x05" + bytes(20 * MIB),
+}
+
+
+@pytest.mark.parametrize("name", GREEDY)
+def test_no_message_takes_much_more_memory_than_its_bytes(name: str) -> None:
+    """24 MiB of empty maps would be 1.6 GB of them."""
+    data = GREEDY[name]
+    assert len(data) <= 25 * MIB
+    tracemalloc.start()
+    try:
+        refused(data, m.Episode)
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert most < 4 * MIB + 2 * len(data)
+    if name not in ("an extension", "long names"):
+        assert most < 16 * MIB
+
+
+def test_the_largest_messages_are_within_the_limits() -> None:
+    turn, told = message(m.Turn), m.Told(name="x" * 64, value=1)
+    turns = m.Turns(turns=(turn,) * 1000)
+    state = message(m.ReplayState, by_action=(1, 2, 3), retention=(told,) * 64)
+    ack = m.EpisodeAck(accepted=False, reason="\N{GRINNING FACE}" * 1000)
+    for some in (turns, state, ack, make_episode(5000, worlds=tuple(f"w{i}" for i in range(64)))):
+        assert decode(encode(some), type(some)) == some
+
+
+@pytest.mark.parametrize(
+    ("cls", "field", "value"),
+    [
+        (m.Episode, "weights_version", 2**32),
+        (m.Episode, "positions", np.array([1e7, 0, 0], "<f4").tobytes()),
+        (m.EpisodeAck, "reason", "x" * 1001),
+        (m.RobotProgress, "robot_episodes", 2**32),
+        (m.RobotProgress, "robot_fills", 2**32),
+        (m.RobotProgress, "robot_life", "x"),
+        (m.Told, "name", "x" * 65),
+        (m.ReplayState, "known_version", 2**32),
+        (m.ReplayState, "fitness_mean_100", 1e300),
+        (m.ReplayState, "fitness_mean_100", -1.0),
+        (m.ReplayState, "lineage", "x" * 16),
+        (m.Turn, "lineage", "0" * 15),
+        (m.LearnerState, "weights_version", 2**32),
+        (m.LearnerState, "loss", -0.5),
+        (m.LearnerState, "loss", 1e39),
+        (m.Weights, "version", 2**32),
+        (m.Weights, "part", 64),
+        (m.Weights, "data", bytes(4 * MIB + 1)),
+    ],
+)
+def test_values_beyond_what_is_possible_are_refused(
+    cls: type[m.Message], field: str, value: Any
+) -> None:
+    good = make_episode(1) if cls is m.Episode else plain(cls)
+    assert field in refused({**fields_of(good), field: value}, cls)

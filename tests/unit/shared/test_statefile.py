@@ -27,7 +27,7 @@ def test_values_that_are_kept_can_be_read_again_and_again(tmp_path: Path) -> Non
     statefile.save(path, STATE)
     assert statefile.read(path) == statefile.read(path) == STATE
     path.write_bytes(b"\xc1")
-    with pytest.raises(StateError, match="damaged.*kept.unreadable-1 now"):
+    with pytest.raises(StateError, match=r"damaged.*kept\.unreadable-1 now"):
         statefile.read(path)
     assert path.with_name("kept.unreadable-1").read_bytes() == b"\xc1"
 

@@ -198,7 +198,7 @@ def test_the_same_identity_with_other_content_is_no_duplicate(
     memory: Memory, other: dict[str, Any]
 ) -> None:
     memory.storage.commit(make_episode(5, seed=3))
-    with pytest.raises(Refused, match="identity: robot1/a{12}/3 is stored with other content"):
+    with pytest.raises(Refused, match=r"identity: robot1/a{12}/3 is stored with other content"):
         memory.storage.commit(make_episode(5, seed=3, **other))
     assert memory.storage.commit(make_episode(5, seed=3)).duplicate
 

@@ -512,7 +512,9 @@ def test_asking_beyond_the_newest_change_gives_the_newest() -> None:
         b.turn()
         parts, end = pulled(b.storage.feed.changes(0, 99, NO_LINEAGE))
         assert (len(parts), end.change) == (1, 1)
-        assert pulled(b.storage.feed.changes(5, 9, b.lineages[1]))[1].gone  # a mirror of another life of this run
+        assert pulled(b.storage.feed.changes(5, 9, b.lineages[1]))[
+            1
+        ].gone  # a mirror of another life of this run
 
 
 def test_forgotten_changes_are_gone_and_their_samples_deleted(
