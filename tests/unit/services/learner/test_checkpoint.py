@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from safetensors import safe_open
 from safetensors.torch import save
 
 from services.learner import checkpoint
+from services.learner.history import Place
 from shared.config import LearningConfig, NetworkConfig, Numerics
 from shared.errors import StateError
 from shared.rl.learning import Trainer
@@ -161,3 +163,65 @@ def test_a_missing_tensor_is_told_by_its_name(written: tuple[Path, Trainer], nam
     path.write_bytes(save(tensors, header))
     with pytest.raises(StateError, match=name.replace(".", r"\.")):
         checkpoint.read(path, make_trainer(), IDENTITY)
+
+
+# ------------------------------------------------------------------------- what goes wrong
+
+
+def test_the_lineage_comes_back_and_an_older_file_has_none(written: tuple[Path, Trainer]) -> None:
+    path, trainer = written
+    checkpoint.write(path, trainer, 4, IDENTITY, "ab" * 8)
+    assert checkpoint.read(path, make_trainer(), IDENTITY) == Place(4, "ab" * 8)
+    with safe_open(path, framework="pt") as file:
+        header = json.loads(file.metadata()["state"])
+    del header["lineage"]
+    tensors = {name: t.contiguous() for name, t in trainer.tensors().items()}
+    path.write_bytes(save(tensors, {"state": json.dumps(header)}))
+    assert checkpoint.read(path, make_trainer(), IDENTITY) == Place(4, "")
+
+
+@pytest.mark.parametrize("name", ["train.out.bias", "target.conv1.weight", "square_avg.out.bias"])
+def test_numbers_that_are_not_finite_leave_the_last_good_checkpoint(
+    written: tuple[Path, Trainer], name: str
+) -> None:
+    path, trainer = written
+    before = path.read_bytes()
+    with torch.no_grad():
+        trainer.tensors()[name].view(-1)[0] = math.nan
+    with pytest.raises(FloatingPointError, match=f"{name} is not finite"):
+        checkpoint.write(path, trainer, 4, IDENTITY)
+    assert path.read_bytes() == before
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+    tensors = {n: t.contiguous() for n, t in trainer.tensors().items()}
+    with safe_open(path, framework="pt") as file:
+        header = file.metadata()
+    path.write_bytes(save(tensors, header))
+    with pytest.raises(checkpoint.Damaged, match=f"{name} is not finite"):
+        checkpoint.read(path, make_trainer(), IDENTITY)
+
+
+def test_an_unreadable_checkpoint_is_kept_and_the_one_before_taken(
+    written: tuple[Path, Trainer],
+) -> None:
+    path, trainer = written
+    checkpoint.write(path, trainer, 4, IDENTITY)
+    path.write_bytes(path.read_bytes()[:-1])
+    damaged = path.read_bytes()
+    with pytest.raises(
+        StateError, match=r"damaged.*unreadable-1 now, and the next start goes on from the one bef"
+    ):
+        checkpoint.take_up(path, make_trainer(), IDENTITY)
+    assert path.with_name(f"{path.name}.unreadable-1").read_bytes() == damaged
+    assert checkpoint.take_up(path, make_trainer(), IDENTITY).episode == 3
+    path.write_bytes(b"")
+    with pytest.raises(StateError, match=r"unreadable-2 now, and the next start begins with new"):
+        checkpoint.take_up(path, make_trainer(), IDENTITY)
+    assert checkpoint.take_up(path, make_trainer(), IDENTITY) == Place()
+    assert path.with_name(f"{path.name}.unreadable-1").read_bytes() == damaged
+
+
+def test_a_checkpoint_of_another_run_stays_where_it_is(written: tuple[Path, Trainer]) -> None:
+    path, _ = written
+    with pytest.raises(StateError, match="run2"):
+        checkpoint.take_up(path, make_trainer(), "run2/0123456789abcdef")
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
