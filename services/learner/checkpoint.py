@@ -43,8 +43,8 @@ def write(
         "counters": trainer.counters(),
     }
     tensors = {name: t.cpu().contiguous() for name, t in trainer.tensors().items()}
-    if odd := [name for name, t in tensors.items() if not bool(torch.isfinite(t).all())]:
-        raise FloatingPointError(f"{odd[0]} is not finite")
+    if odd := _not_finite(tensors):
+        raise FloatingPointError(f"{odd} is not finite")
     data = save_safetensors(tensors, {"state": json.dumps(header)})
     if path.exists():
         previous = path.with_name(path.name + PREVIOUS)
@@ -69,8 +69,8 @@ def read(path: Path, trainer: Trainer, identity: str) -> Place:
                 f"{path}: expected a checkpoint of {(SCHEMA, identity)}, "
                 f"found {(header['schema'], header['identity'])}"
             )
-        if odd := [name for name, t in tensors.items() if not bool(torch.isfinite(t).all())]:
-            raise ValueError(f"{odd[0]} is not finite")
+        if odd := _not_finite(tensors):
+            raise ValueError(f"{odd} is not finite")
         trainer.restore(tensors, header["counters"])
         return Place(int(header["episode"]), str(header.get("lineage", "")))
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
@@ -92,3 +92,9 @@ def take_up(path: Path, trainer: Trainer, identity: str) -> Place:
             raise StateError(f"{told}, and the next start begins with new networks") from error
         previous.rename(path)
         raise StateError(f"{told}, and the next start goes on from the one before") from error
+
+
+def _not_finite(tensors: dict[str, torch.Tensor]) -> str:
+    """Name of a tensor with a number that is not finite; empty if there is none."""
+    finite = ((name, bool(torch.isfinite(t).all())) for name, t in tensors.items())
+    return next((name for name, all_are in finite if not all_are), "")

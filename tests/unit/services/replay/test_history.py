@@ -229,6 +229,12 @@ def test_an_earlier_driver_life_is_not_forgotten(memory: Memory) -> None:
         memory.storage.commit(make_episode(5, seed=2, last_sequence=9, **first))
 
 
+def test_lost_samples_may_be_of_an_earlier_driver_life(memory: Memory) -> None:
+    memory.storage.commit(make_episode(5, seed=0, last_sequence=9))
+    lost = make_episode(5, seed=1, last_sequence=14, dropped_samples=100)
+    assert memory.storage.commit(lost).counters.dropped_samples == 100
+
+
 def test_more_samples_than_actions_of_a_life_are_refused(memory: Memory) -> None:
     with pytest.raises(Refused, match="sequences: 5 samples up to 3 "):
         memory.storage.commit(make_episode(5, last_sequence=3))
