@@ -39,7 +39,7 @@ Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
 Version = Annotated[int, Field(ge=0, lt=2**32)]
 """Of the target network: each sample keeps the one that chose its action, as uint32."""
 Stored = Annotated[int, Field(ge=0, lt=2**32)]
-"""Counts that samples keep as uint32."""
+"""What samples keep as uint32, and numbers of actions."""
 Reason = Annotated[str, Field(max_length=1000)]
 Lineage = Hash
 NO_LINEAGE = "0" * 16
@@ -304,7 +304,7 @@ class Episode(Message):
     positions: bytes
     """float32 [n, 3]: x_m, y_m, heading_rad at each sample."""
     robot_life: Life
-    last_sequence: Count
+    last_sequence: Stored
     """Driver sequence of the newest action whose sample is in here or counted as dropped. All
     samples are of actions after the `last_sequence` of the same `robot_life` before."""
     laps_left: Few = 0
@@ -379,7 +379,7 @@ class RobotProgress(Message):
     """Newest global episode number committed."""
     robot_life: Annotated[str, Field(pattern=r"^([0-9a-f]{12})?$")]
     """Driver life of the robot's newest stored sample; empty if none."""
-    last_sequence: Annotated[int, Field(ge=-1, lt=2**63)]
+    last_sequence: Annotated[int, Field(ge=-1, lt=2**32)]
     """Driver sequence of that sample; -1 if none."""
 
 
