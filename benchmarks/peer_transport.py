@@ -175,10 +175,11 @@ class OurSender:
 
 
 @contextmanager
-def router(folder: Path) -> Iterator[Config]:
+def router(folder: Path, mode: Mode) -> Iterator[Config]:
     """A router process; the configuration that reaches it."""
     bus = {"endpoint": free_endpoint()}
-    config = Config.model_validate({"run": {"name": "bench"}, "bus": bus})
+    network = frames.network_config(mode).model_dump()
+    config = Config.model_validate({"run": {"name": "bench"}, "bus": bus, "network": network})
     stored = settings.claim(folder, config)
     specs = child_specs(config, stored, folder, config.bus.endpoint)
     (folder / "logs").mkdir(exist_ok=True)
@@ -215,7 +216,7 @@ def measure(mode: Mode) -> Times:
     times: Times = {PEER: [], "ours": []}
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run"
-        config = stack.enter_context(router(folder))
+        config = stack.enter_context(router(folder, mode))
         own = OurSender(stack.enter_context(connected(config)))
         stack.callback(own.close)
         peer = GrpcSender()

@@ -57,7 +57,7 @@ def make_episode(number: int, samples: int, *, fill: bool, images: Images | None
         sample_worlds=bytes(samples),
         positions=bytes(12 * samples),
         robot_life=LIFE,
-        last_sequence=number * samples,
+        last_sequence=(number + 1) * samples - 1,
     )
 
 

@@ -35,7 +35,7 @@ from shared.config import ActorNumerics, Config
 from shared.facts import IMAGE_BYTES
 from shared.inbox import Inbox
 from shared.keys import EPISODE, LEARNER_STATE, REPLAY_STATE, WEIGHTS
-from shared.messages import EpisodeAck, LearnerState, ReplayState
+from shared.messages import NO_LINEAGE, EpisodeAck, LearnerState, ReplayState
 from shared.numerics import choose, settle_all
 from shared.rl.network import initialised, to_bytes, weights_hash
 from shared.weights import parts
@@ -64,7 +64,7 @@ def snapshot_rate(client: Bus) -> float:
     """MB/s of a snapshot, until the mirror could train on it."""
     mirror = Mirror()
     start_s = time.perf_counter()
-    mirror.reach(client, 1)
+    mirror.reach(client, 0, NO_LINEAGE)  # a snapshot, of whatever there is
     return len(mirror.samples) * IMAGE_BYTES / 1e6 / (time.perf_counter() - start_s)
 
 

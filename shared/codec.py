@@ -14,6 +14,10 @@ from shared.messages import PROTOCOL_VERSION, Message
 M = TypeVar("M", bound=Message)
 LONGEST_PLACE = 100
 """Characters of a field name in an error: the sender may have made it up."""
+MAX_ARRAY, MAX_MAP, MAX_STR = 1000, 64, 4096
+"""Entries of an array and of a map, bytes of a string: no message has more."""
+MAX_VALUES = 20_000
+"""Values of a message, those inside others included: a list of 1000 turns has half as many."""
 
 
 def encode(message: Message) -> bytes:
@@ -32,7 +36,7 @@ def decode(data: bytes, *types: type[M]) -> M:
     """
     expected = " or ".join(t.__name__ for t in types)
     try:
-        fields = msgpack.unpackb(data, raw=False, use_list=False, strict_map_key=True)
+        fields = _unpacked(data)
     except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
         raise BadMessage(
             f"expected {expected}, got {len(data)} bytes that are not msgpack: {error}"
@@ -51,6 +55,35 @@ def decode(data: bytes, *types: type[M]) -> M:
             except ValidationError as error:
                 raise BadMessage(f"{name}: {first_problem(error)}") from error
     raise BadMessage(f"expected {expected}, got type {brief(name)}")
+
+
+def _unpacked(data: bytes) -> Any:
+    """What msgpack makes of the bytes. It takes little more memory than they do, or raises.
+
+    A byte may stand for an empty map of 64 bytes: values are counted as their containers close, and
+    the open ones are few, because msgpack bounds their depth.
+    """
+    left = MAX_VALUES
+
+    def count(container: Any) -> Any:
+        nonlocal left
+        left -= 1 + len(container)
+        if left < 0:
+            raise ValueError(f"more than {MAX_VALUES} values")
+        return container
+
+    return msgpack.unpackb(
+        data,
+        raw=False,
+        use_list=False,
+        strict_map_key=True,
+        list_hook=count,
+        object_hook=count,
+        max_array_len=MAX_ARRAY,
+        max_map_len=MAX_MAP,
+        max_str_len=MAX_STR,
+        max_ext_len=0,
+    )
 
 
 def first_problem(error: ValidationError) -> str:

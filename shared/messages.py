@@ -43,6 +43,18 @@ Channel = Annotated[int, Field(ge=0, le=255)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
 
+Version = Annotated[int, Field(ge=0, lt=2**32)]
+"""Of the target network: each sample keeps the one that chose its action, as uint32."""
+Stored = Annotated[int, Field(ge=0, lt=2**32)]
+"""What samples keep as uint32, and numbers of actions."""
+Reason = Annotated[str, Field(max_length=1000)]
+Lineage = Hash
+NO_LINEAGE = "0" * 16
+"""The lineage of a memory without submissions."""
+MAX_PLACE = 1e6
+"""Metres or radians from the origin: beyond it no number of a pose makes sense."""
+MAX_FLOAT32 = 3.5e38
+
 MAX_FAULTS = 24
 """Kinds of faults that a driver tells of: the most frequent ones."""
 
@@ -352,7 +364,7 @@ class Episode(Message):
     """Gathered to fill the memory, and not counted as an episode (E9)."""
     ended: Literal["bump", "full", "interrupted"]
     bump: bool
-    weights_version: Count
+    weights_version: Version
     """Version that predicted the rewards. Replay uses it or a newer one for this turn."""
     fitness: Few
     """Actions without a bump including carried-over ones, at most 500 (A37, E10)."""
@@ -375,14 +387,15 @@ class Episode(Message):
     sample_episodes: bytes
     """uint32 [n]: the robot's own episode count when each was gathered (carried ones: one less)."""
     sample_versions: bytes
-    """uint32 [n]: weights version that chose each action."""
+    """uint32 [n]: weights version that chose each action, at most `weights_version`."""
     sample_worlds: bytes
     """uint8 [n]: index into `worlds`."""
     positions: bytes
     """float32 [n, 3]: x_m, y_m, heading_rad at each sample."""
     robot_life: Life
-    last_sequence: Count
-    """Driver sequence of the newest action whose sample is in here or counted as dropped."""
+    last_sequence: Stored
+    """Driver sequence of the newest action whose sample is in here or counted as dropped. All
+    samples are of actions after the `last_sequence` of the same `robot_life` before."""
     laps_left: Few = 0
     laps_right: Few = 0
     """Laps completed while the samples were gathered."""
@@ -402,8 +415,8 @@ class Episode(Message):
         rewards = np.frombuffer(self.sample_rewards, "<f4")
         if not bool(np.all(np.abs(rewards) <= 1.0)):  # also false for NaN
             raise ValueError("sample_rewards: expected -1..1")
-        if not bool(np.all(np.isfinite(np.frombuffer(self.positions, "<f4")))):
-            raise ValueError("positions: expected finite numbers")
+        if not bool(np.all(np.abs(np.frombuffer(self.positions, "<f4")) <= MAX_PLACE)):
+            raise ValueError(f"positions: expected numbers within {MAX_PLACE:.0f}")
         return self
 
     @property
@@ -422,8 +435,8 @@ class EpisodeAck(Message):
     """The episode is on disk, exactly once. Replay to actor. It says nothing about training."""
 
     accepted: bool
-    reason: str = ""
-    """Why it was refused for good; empty if accepted."""
+    reason: Reason = ""
+    """Why it was refused for good, after its kind and a colon; empty if accepted."""
     duplicate: bool = False
     commit: Count = 0
     """Number of the submission among all, those of the fill included."""
@@ -447,15 +460,15 @@ class RobotProgress(Message):
     filling: bool
     """The memory is still being filled (A13)."""
     fill_missing: Count
-    robot_fills: Count
+    robot_fills: Stored
     """Fill submissions of this robot so far."""
-    robot_episodes: Count
+    robot_episodes: Stored
     """Counted episodes of this robot so far."""
     episode: Count
     """Newest global episode number committed."""
-    robot_life: str
+    robot_life: Annotated[str, Field(pattern=r"^([0-9a-f]{12})?$")]
     """Driver life of the robot's newest stored sample; empty if none."""
-    last_sequence: Annotated[int, Field(ge=-1, lt=2**63)]
+    last_sequence: Annotated[int, Field(ge=-1, lt=2**32)]
     """Driver sequence of that sample; -1 if none."""
 
 
@@ -465,7 +478,7 @@ class RobotProgress(Message):
 class Told(Message):
     """One number that a retention strategy reports."""
 
-    name: str
+    name: Annotated[str, Field(max_length=64)]
     value: Count
 
 
@@ -483,16 +496,22 @@ class ReplayState(Message):
     """Newest episode whose discard and equalisation are done. The learner may train on it."""
     turn_change: Count
     """Change number the learner must reach before training on `turn`."""
+    lineage: Lineage
+    """Of the memory as of `turn_change`: see `Turn`."""
     size: Count
     capacity: Count
     filling: bool
     by_action: Annotated[tuple[Count, ...], Field(min_length=ACTION_COUNT, max_length=ACTION_COUNT)]
     retention: Annotated[tuple[Told, ...], Field(max_length=64)] = ()
     """What the retention strategy reports."""
-    weights_version: Count
+    weights_version: Version
+    """Version that the memory is maintained with."""
+    known_version: Version
+    """Newest version that replay has or knows from an episode. A learner that has lost its
+    checkpoint goes on above it."""
     activity: Literal["idle", "committing", "descriptors", "equalising", "discarding", "waiting"]
     progress: Fraction = 1.0
-    fitness_mean_100: float
+    fitness_mean_100: Annotated[float, Field(ge=0.0, le=2.0**31)]
     bumps: Count
     laps_left: Count
     laps_right: Count
@@ -522,12 +541,15 @@ class Turn(Message):
     total_actions: Count
     """Actions of counted episodes until then, those of this one included."""
     samples: Count
+    lineage: Lineage
+    """Of the memory as of `change`: a hash over all submissions until then. Two memories in which
+    an episode has another lineage have different histories."""
 
 
 class Turns(Message):
     """Answer to `TurnsRequest`, in order of episode, without gaps."""
 
-    turns: tuple[Turn, ...]
+    turns: Annotated[tuple[Turn, ...], Field(max_length=1000)]
 
 
 class ChangesRequest(Message):
@@ -535,6 +557,8 @@ class ChangesRequest(Message):
 
     since: Count
     upto: Count
+    lineage: Lineage
+    """That of the mirror at `since`."""
 
 
 class SnapshotRequest(Message):
@@ -583,8 +607,11 @@ class FeedEnd(Message):
     """Rows sent before, over all parts, to be compared with what arrived."""
     messages: Count
     """Parts sent before."""
+    lineage: Lineage
+    """Of the memory as of `change`."""
     gone: bool = False
-    """The changes asked for are no longer kept: take a snapshot."""
+    """The changes asked for are no longer kept, or the mirror has another lineage: take a
+    snapshot."""
 
 
 class MiniBatchRequest(Message):
@@ -605,7 +632,7 @@ class LearnerState(Message):
     life: Life
     episode: Count
     """Newest finished turn: trained, target rule applied, checkpoint on disk."""
-    weights_version: Count
+    weights_version: Version
     """Newest target version; fetch it by `WeightsRequest`."""
     weights_hash: Hash
     activity: Literal["waiting", "synchronising", "training", "fitting", "checkpoint"]
@@ -613,7 +640,7 @@ class LearnerState(Message):
     fit_batch: Count = 0
     fit_batches: Count = 0
     """Mini-batches of the running fitting phase, all epochs."""
-    loss: float | None
+    loss: Annotated[float, Field(ge=0.0, le=MAX_FLOAT32)] | None
     """Mean loss of the newest turn trained."""
     train_steps: Count
     fits: Count
@@ -630,12 +657,12 @@ class WeightsRequest(Message):
 class Weights(Message):
     """One version of the target network, in parts of about 1 MB. The learner's answer."""
 
-    version: Count
+    version: Version
     hash: Hash
     """First 16 hex digits of SHA-256 over all bytes."""
-    part: Count
+    part: Annotated[int, Field(ge=0, lt=64)]
     parts: Annotated[int, Field(ge=1, le=64)]
-    data: bytes
+    data: Annotated[bytes, Field(max_length=4 * 1024 * 1024)]
     """safetensors; concatenate the parts in order."""
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,7 @@ def write_atomically(path: Path, data: bytes) -> None:
         file.flush()
         os.fsync(file.fileno())
     beside.replace(path)
-    directory = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(directory)
-    finally:
-        os.close(directory)
+    _sync(path.parent)
 
 
 def create(path: Path, data: bytes) -> None:
@@ -55,22 +52,38 @@ def save(path: Path, state: dict[str, Any]) -> None:
 def take(path: Path) -> dict[str, Any] | None:
     """Read saved values and remove the file: whoever is killed later must not come back to them.
 
-    Returns None when there is no file. Raises StateError when it is damaged.
+    The file is gone for good when this returns. Returns None when there is none. Raises StateError
+    when it is damaged; it is set aside then.
     """
-    data = _bytes(path)
-    if data is None:
-        return None
-    path.unlink()
-    return _values(path, data)
+    state = read(path)
+    if state is not None:
+        path.unlink()
+        _sync(path.parent)
+    return state
 
 
 def read(path: Path) -> dict[str, Any] | None:
     """Read saved values and leave them there.
 
-    Returns None when there is no file. Raises StateError when it is damaged.
+    Returns None when there is no file. Raises StateError when it is damaged; it is set aside then.
     """
-    data = _bytes(path)
-    return None if data is None else _values(path, data)
+    try:
+        data = _bytes(path)
+        return None if data is None else _values(path, data)
+    except StateError as error:
+        raise StateError(f"{error}; it lies at {set_aside(path)} now") from error
+
+
+def set_aside(path: Path) -> Path:
+    """Give a file that cannot be read another name beside it, so that nothing is ever lost."""
+    aside = next(
+        name
+        for n in count(1)
+        if not (name := path.with_name(f"{path.name}.unreadable-{n}")).exists()
+    )
+    path.rename(aside)
+    _sync(path.parent)
+    return aside
 
 
 def _bytes(path: Path) -> bytes | None:
@@ -80,6 +93,15 @@ def _bytes(path: Path) -> bytes | None:
         return path.read_bytes()
     except FileNotFoundError:
         return None
+
+
+def _sync(folder: Path) -> None:
+    """Bring what was renamed or removed in a folder to disk."""
+    directory = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(directory)
+    finally:
+        os.close(directory)
 
 
 def _values(path: Path, data: bytes) -> dict[str, Any]:

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
+import torch
+
+from shared.complaints import Complaints
 from shared.errors import BadMessage, BusError, PeerSilent
 from shared.keys import LEARNER_STATE, WEIGHTS
 from shared.messages import LearnerState, Weights, WeightsRequest
-from shared.rl.network import WeightsHash
+from shared.rl.network import MAX_WEIGHT_BYTES, QNetwork, WeightsHash, checked
 from shared.service import TICK_S, Service, Stopped
 
 if TYPE_CHECKING:
@@ -18,6 +22,8 @@ if TYPE_CHECKING:
 
 PART_BYTES = 1024 * 1024
 RETRY_S = 0.05
+LONGEST_RETRY_S = 10.0
+"""Period of asking for a version that is announced but not delivered, or refused."""
 log = logging.getLogger(__name__)
 
 
@@ -30,10 +36,13 @@ def parts(version: int, data: bytes, digest: str) -> Iterator[Weights]:
 
 def fetch(bus: Bus) -> tuple[int, bytes]:
     """The newest version and its safetensors bytes. Raises BusError or BadMessage."""
-    received, digest = [], WeightsHash()
+    received, digest, size = [], WeightsHash(), 0
     for message in bus.request_many(WEIGHTS, WeightsRequest(), Weights):
         digest.add(message.data)  # while the next part is on its way
         received.append(message)
+        size += len(message.data)
+        if size > MAX_WEIGHT_BYTES or len(received) > message.parts:
+            raise BadMessage(f"weights: more than {message.parts} parts or too many bytes")
     first = received[0]
     if [m.part for m in received] != list(range(first.parts)):
         raise PeerSilent(f"weights: expected {first.parts} parts, got {len(received)}")
@@ -42,20 +51,56 @@ def fetch(bus: Bus) -> tuple[int, bytes]:
     return first.version, b"".join(message.data for message in received)
 
 
+class Wanted:
+    """Which version to ask for, and when: as the newest announcement says, true or not.
+
+    A version that was never made must not keep a true one away. What is announced and yet does not
+    come is asked for ever more rarely.
+    """
+
+    def __init__(self) -> None:
+        self.version = 1
+        self._period_s, self._next_s = RETRY_S, 0.0
+
+    def note(self, version: int) -> None:
+        """Take the newest announcement, which may say less than the one before."""
+        if version != self.version:
+            self.version, self._period_s, self._next_s = version, RETRY_S, 0.0
+
+    def due_s(self, now_s: float) -> float:
+        """How long to wait before it is asked for again; 0 for now."""
+        return max(self._next_s - now_s, 0.0)
+
+    def missed(self, now_s: float, *, answered: bool) -> bool:
+        """It did not come. answered: something came in its place. Whether that lasts for long."""
+        self._next_s = now_s + self._period_s
+        if answered:
+            self._period_s = min(2.0 * self._period_s, LONGEST_RETRY_S)
+        return self._period_s == LONGEST_RETRY_S
+
+
 class WeightsFetcher(threading.Thread):
     """Holds the newest target network; a learner that does not answer holds up nobody.
 
-    `notify` is called whenever there is a newer version (from this thread).
+    What does not fit the run's network is refused: the weights before it stay. `notify` is called
+    whenever there is a newer version (from this thread).
     """
 
     def __init__(self, me: Service, notify: Callable[[], None]) -> None:
         super().__init__(name="weights", daemon=True)
         self._me, self._notify = me, notify
+        with torch.device("meta"):  # names and shapes without values
+            self._network = QNetwork(me.config.network)
         self._inbox = me.bus.inbox()
         self._inbox.subscribe(LEARNER_STATE, "main")
         self._newer = threading.Condition()
         self._newest: tuple[int, bytes] = (0, b"")
+        self._wanted = Wanted()
+        self._complaints = Complaints(log.warning)
         self.refused = 0
+        """Answers that were no weights of this run's network."""
+        self.heard: tuple[int, float] = (0, -float("inf"))
+        """Version that the newest announcement named, and when it came (`time.monotonic`)."""
         me.stop.on_set(self._inbox.wake)
         self.start()
 
@@ -75,26 +120,38 @@ class WeightsFetcher(threading.Thread):
 
     def run(self) -> None:
         """Fetch whatever the learner announces, until the service stops."""
-        announced = 1
+        wanted = self._wanted
         while not self._me.stop.is_set():
-            if announced <= self._newest[0]:
-                self._inbox.wait(TICK_S)
+            waiting_s = wanted.due_s(time.monotonic())
+            if wanted.version <= self._newest[0] or waiting_s:
+                self._inbox.wait(min(waiting_s or TICK_S, TICK_S))
             for _, state in self._inbox.take(LEARNER_STATE, LearnerState):
-                announced = max(announced, state.weights_version)
-            if announced > self._newest[0] and not self._fetch():
-                self._me.stop.wait(RETRY_S)
+                wanted.note(state.weights_version)
+                self.heard = (state.weights_version, time.monotonic())
+            if wanted.version > self._newest[0] and not wanted.due_s(time.monotonic()):
+                self._fetch()
 
-    def _fetch(self) -> bool:
-        """One attempt; whether anything newer came."""
+    def _fetch(self) -> None:
+        """One attempt to have something newer."""
         try:
             version, data = fetch(self._me.bus)
-        except (BusError, BadMessage) as error:
+            checked(self._network, data)
+        except BusError as error:
             log.debug("weights not fetched: %s", error)
-            return False
-        if version <= self._newest[0]:
-            return False
-        with self._newer:
-            self._newest = (version, data)
-            self._newer.notify_all()
-        self._notify()
-        return True
+            self._wanted.missed(time.monotonic(), answered=False)
+            return
+        except (BadMessage, ValueError) as error:
+            self.refused += 1
+            self._wanted.missed(time.monotonic(), answered=True)
+            self._complaints.tell("refused", f"weights refused, the older ones stay: {error}")
+            return
+        if self._newest[0] < version <= self._wanted.version + 1:  # it may be about to tell
+            with self._newer:
+                self._newest = (version, data)
+                self._newer.notify_all()
+            self._notify()
+        if self._wanted.version > self._newest[0] and self._wanted.missed(
+            time.monotonic(), answered=True
+        ):
+            told = f"weights version {self._wanted.version} is announced, but {version} is served"
+            self._complaints.tell("missing", told)

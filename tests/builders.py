@@ -119,7 +119,7 @@ def make_episode(n: int, *, seed: int = 0, images: Images | None = None, **given
         "sample_worlds": bytes(n),
         "positions": rng.uniform(-5.0, 5.0, (n, 3)).astype("<f4").tobytes(),
         "robot_life": OTHER_LIFE,
-        "last_sequence": n - 1,
+        "last_sequence": 10_000 * seed + n - 1,
     }
     return Episode(**{**plain, **given})
 

@@ -106,11 +106,11 @@ class Cluster:
     def run_to_its_end(self, service: str, name: str) -> int | None:
         """Start a service as `start` does, under another name, and wait for its exit code."""
         self._launch(name, service, "--run-dir", str(self.folder))
-        return self.ended(name, 20)
+        return self.ended(name)
 
-    def ended(self, name: str, timeout_s: float) -> int | None:
+    def ended(self, name: str) -> int | None:
         """The exit code of a process that ends by itself."""
-        return self._processes[name].wait(timeout_s)
+        return self._processes[name].wait(20)
 
     def _launch(self, name: str, service: str, *options: str) -> None:
         self._forget(name)

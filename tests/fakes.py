@@ -16,7 +16,7 @@ from shared.messages import PROTOCOL_VERSION, Halts, Message, Release, ServiceRe
 from shared.service import new_life
 
 M = TypeVar("M", bound=Message)
-TEXTS = {"life": "0" * 12, "hash": "0" * 16, "config": "0" * 16}
+TEXTS = {"life": "0" * 12, "hash": "0" * 16, "config": "0" * 16, "lineage": "0" * 16}
 
 
 def message(cls: type[M], **given: Any) -> M:

@@ -78,7 +78,7 @@ def restore(folder: Path, loop: SingleProcess) -> dict[str, Any]:
     Raises:
         StateError: The snapshot is damaged, or of another network or seed.
     """
-    episode = checkpoint.read(folder / CHECKPOINT, loop.trainer, _identity(loop))
+    episode = checkpoint.read(folder / CHECKPOINT, loop.trainer, _identity(loop)).episode
     try:
         state = msgpack.unpackb((folder / STATE).read_bytes())
         if state["schema"] != SCHEMA:

@@ -10,7 +10,7 @@ from shared import columns
 from shared.bus import Bus
 from shared.errors import PeerSilent
 from shared.keys import CHANGES, SNAPSHOT
-from shared.messages import Change, ChangesRequest, FeedEnd, SnapshotRequest
+from shared.messages import NO_LINEAGE, Change, ChangesRequest, FeedEnd, SnapshotRequest
 from shared.rl.memory import MIRROR, SampleStore
 
 TRANSFER_TIMEOUT_S = 60.0
@@ -22,29 +22,33 @@ class Mirror:
     def __init__(self) -> None:
         self.samples = SampleStore()
         self.number: int | None = None
+        self.lineage = NO_LINEAGE
+        """Of the memory that this is the mirror of, as of `number`."""
         self.resyncs = 0
 
-    def reach(self, bus: Bus, number: int) -> None:
+    def reach(self, bus: Bus, number: int, lineage: str) -> None:
         """Bring the mirror to change `number` (beyond it only after a gap: then by snapshot).
 
-        Raises BusError; the mirror then stands at a complete change, or starts anew.
+        lineage: of the memory as of that change. Raises BusError; the mirror then stands at a
+        complete change, or starts anew.
         """
         if self.number is not None and self.number >= number:
             return
         if self.number is not None:
-            request = ChangesRequest(since=self.number, upto=number)
+            request = ChangesRequest(since=self.number, upto=number, lineage=self.lineage)
             parts, end = _received(
                 bus.request_many(CHANGES, request, Change, FeedEnd, timeout_s=TRANSFER_TIMEOUT_S)
             )
-            if not end.gone and end.change == number:
+            if not end.gone and (end.change, end.lineage) == (number, lineage):
+                self.number = None  # until all of them are in
                 for part in parts:
-                    apply(self.samples, part)
-                self.number = number
+                    _take(self.samples, part)
+                self.number, self.lineage = number, lineage
                 return
             self.resyncs += 1
-        self._snapshot(bus, number)
+        self._snapshot(bus, number, lineage)
 
-    def _snapshot(self, bus: Bus, number: int) -> None:
+    def _snapshot(self, bus: Bus, number: int, lineage: str) -> None:
         self.samples, self.number = SampleStore(), None
         replies = bus.request_many(
             SNAPSHOT, SnapshotRequest(), Change, FeedEnd, timeout_s=TRANSFER_TIMEOUT_S
@@ -53,12 +57,15 @@ class Mirror:
         for part in replies:
             if isinstance(part, FeedEnd):
                 _check_complete(part, rows, messages)
-                if part.change < number:
-                    raise PeerSilent(f"snapshot at change {part.change}, expected {number}")
-                self.samples, self.number = samples, part.change
+                if part.change < number or (part.change == number and part.lineage != lineage):
+                    raise PeerSilent(
+                        f"snapshot at change {part.change} of lineage {part.lineage}, "
+                        f"expected {number} of {lineage}"
+                    )
+                self.samples, self.number, self.lineage = samples, part.change, part.lineage
                 return
             assert isinstance(part, Change)
-            apply(samples, part)
+            _take(samples, part)
             rows, messages = rows + part.count, messages + 1
         raise PeerSilent(f"snapshot broke off after {rows} rows")
 
@@ -79,6 +86,14 @@ def _check_complete(end: FeedEnd, rows: int, messages: int) -> None:
             f"transfer incomplete: expected {end.rows} rows in {end.messages} parts, "
             f"got {rows} in {messages}"
         )
+
+
+def _take(samples: SampleStore, part: Change) -> None:
+    """Apply one part of a transfer. Raises PeerSilent when it does not fit."""
+    try:
+        apply(samples, part)
+    except (KeyError, ValueError) as error:
+        raise PeerSilent(f"change {part.number} does not fit the mirror: {error}") from error
 
 
 def apply(samples: SampleStore, part: Change) -> None:

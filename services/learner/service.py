@@ -3,29 +3,42 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
 from services.learner import checkpoint
+from services.learner.history import Place
 from services.learner.mirror import Mirror
 from services.processes import MAIN
+from shared.complaints import Complaints
 from shared.config import Config
-from shared.errors import StateError
+from shared.errors import BadMessage, BusError, PeerSilent, StateError
 from shared.inbox import Inbox
 from shared.keys import LEARNER_STATE, REPLAY_STATE, TURNS, WEIGHTS
 from shared.messages import LearnerState, ReplayState, Turn, Turns, TurnsRequest
 from shared.metrics import MetricsLog
 from shared.numerics import settle
 from shared.rl.learning import Trained, Trainer
-from shared.rl.network import to_bytes, weights_hash
+from shared.rl.network import checked, to_bytes, weights_hash
 from shared.rl.schedule import Moment
 from shared.run_record import TRAINING, TRAINING_COLUMNS
 from shared.service import TICK_S, Service, Stopped, service
 from shared.weights import parts
 
 Activity = Literal["waiting", "synchronising", "training", "fitting", "checkpoint"]
+T = TypeVar("T")
+TAKEOVER = 2
+"""How far above the versions that replay knows a learner without its checkpoint goes on: an actor
+may have one more than replay."""
+LAST_TAKEOVER = 2**31
+"""Above this it does not: that many versions were never made."""
+
+
+class OtherTurn(Exception):
+    """Replay does not have the turn any more that it told of."""
 
 
 def run(config: Config, folder: Path, life: str) -> None:
@@ -43,37 +56,37 @@ class LearnerLoop:
         self._identity = f"{config.run.name}/{config.run.seed}"
         numerics = settle(config, folder, "learner")
         self._trainer = Trainer(config.network, config.learning, numerics, config.run.seed)
-        self.episode = checkpoint.read(self._path, self._trainer, self._identity)
+        self._place = checkpoint.take_up(self._path, self._trainer, self._identity)
         self._mirror = Mirror()
-        self._weights = to_bytes(self._trainer.target_network)
+        self._weights = self._checked_weights()
         self._hash = weights_hash(self._weights)
         self._metrics = MetricsLog(folder / TRAINING, TRAINING_COLUMNS)
-        certain = (row for row in self._metrics.rows() if int(row["episode"]) <= self.episode)
-        self._metrics.restart(list(certain))
+        rows, newest = self._metrics.rows(), self._place.episode
+        self._metrics.restart([row for row in rows if int(row["episode"]) <= newest])
         self._activity: Activity = "waiting"
         self._trained = Trained(0.0, 0, 0, 0)
         self._loss: float | None = None
         self._next_beat_s = 0.0
-        self._known_turn = -1
+        self._told: Place | None = None
+        """Where replay says it is, as far as nothing was done about it yet."""
+        self._new = True
+        """No turn was done since the start: versions may still go on above those of others."""
+        self._complaints = Complaints(me.log.warning)
         self._inbox: Inbox = me.bus.inbox()
         self._inbox.subscribe(REPLAY_STATE, "main")
         self._inbox.serve(WEIGHTS)
         me.stop.on_set(self._inbox.wake)
-        me.log.info("continuing after episode %d", self.episode)
+        me.log.info("continuing after episode %d", self._place.episode)
 
     def run(self) -> None:
         """Learn turn by turn until stopped."""
         try:
-            self._check_replay()
             while not self._me.stop.is_set():
-                self._inbox.wait(TICK_S if self._known_turn <= self.episode else 0.0)
+                behind = self._told is not None and self._told != self._place
+                self._inbox.wait(0.0 if behind else TICK_S)
                 self._serve()
-                if self._known_turn > self.episode:
-                    turns = self._ask_turns(self.episode)
-                    for turn in turns:
-                        self._turn(turn)
-                    if not turns:  # an announcement that was not true: wait for the next
-                        self._known_turn = self.episode
+                if behind:
+                    self._catch_up()
         finally:
             self._metrics.close()
 
@@ -84,54 +97,114 @@ class LearnerLoop:
                 for part in parts(self._trainer.version, self._weights, self._hash):
                     request.reply(part)
         for _, state in self._inbox.take(REPLAY_STATE, ReplayState):
-            self._known_turn = max(self._known_turn, state.turn)
+            self._told = Place(state.turn, state.lineage)
+            self._take_over(state.known_version)
         now_s = time.monotonic()
         if announce or now_s >= self._next_beat_s:
             busy = self._activity in ("training", "fitting")
             self._next_beat_s = now_s + (0.25 if busy else self._me.config.bus.heartbeat_s)
             self._me.bus.publish(LEARNER_STATE, self._state())
 
-    def _check_replay(self) -> None:
-        """Refuse a replay memory that never had the episodes of our checkpoint."""
-        if self.episode and not self._ask_turns(self.episode - 1):
-            raise StateError(
-                f"replay has no turn {self.episode}, but the checkpoint {self._path} is of that "
-                f"episode: they do not belong together"
+    def _take_over(self, known: int) -> None:
+        """Go on above the versions that others have, after a start without the newest checkpoint.
+
+        They never take an older one.
+        """
+        own = self._trainer.version
+        if self._new and own < known < LAST_TAKEOVER:
+            self._trainer.version = known + TAKEOVER
+            self._me.log.warning(
+                "weights version %d is known to replay, this learner has come to %d only: it goes "
+                "on as version %d",
+                *(known, own, self._trainer.version),
             )
+
+    def _catch_up(self) -> None:
+        """Do the turns that replay has ready. Raises StateError, Stopped."""
+        self._told = None
+        for turn in self._place.next_turns(self._ask_turns(self._place.since), self._path):
+            try:
+                self._turn(turn)
+            except OtherTurn as error:
+                self._activity = "waiting"
+                self._complaints.tell("turn", str(error))
+                return
 
     def _ask_turns(self, since: int) -> tuple[Turn, ...]:
         """Turns after an episode, as replay has them. Raises Stopped."""
         request = TurnsRequest(since=since)
+        return self._insist("ask replay for turns", lambda: self._turns(request)).turns
 
-        def attempt() -> Turns:
-            self._serve()
-            return self._me.bus.request(TURNS, request, Turns)
+    def _turns(self, request: TurnsRequest) -> Turns:
+        self._serve()
+        return self._me.bus.request(TURNS, request, Turns)
 
-        return self._me.insist("ask replay for turns", attempt).turns
+    def _insist(self, what: str, attempt: Callable[[], T]) -> T:
+        """Ask until there is an answer; one that is no message is none. Raises Stopped."""
+
+        def answered() -> T:
+            try:
+                return attempt()
+            except BadMessage as error:
+                raise PeerSilent(str(error)) from error
+
+        return self._me.insist(what, answered)
 
     def _turn(self, turn: Turn) -> None:
-        """Everything the learner does about one episode (E25). Raises Stopped."""
-        if turn.episode != self.episode + 1:
-            raise StateError(f"expected turn {self.episode + 1}, replay sent {turn.episode}")
+        """Everything the learner does about one episode (E25). Raises Stopped, OtherTurn."""
         start_s = time.monotonic()
         self._activity = "synchronising"
-        self._me.insist("pull changes from replay", lambda: self._reach(turn.change))
+        self._insist("pull changes from replay", lambda: self._reach(turn))
         steps_before = self._trainer.train_steps
         losses = self._learn(turn)
+        self._new = False
         changed = self._trainer.apply_target_rule(turn.episode, turn.bump)
         self._loss = float(np.mean(losses)) if losses else None
         self._record(turn, self._trainer.train_steps - steps_before, time.monotonic() - start_s)
         self._activity = "checkpoint"
-        checkpoint.write(self._path, self._trainer, turn.episode, self._identity)
+        try:
+            weights = self._checked_weights() if changed else self._weights
+            checkpoint.write(self._path, self._trainer, turn.episode, self._identity, turn.lineage)
+        except FloatingPointError as error:
+            raise self._diverged(turn, error) from error
         if changed:
-            self._weights = to_bytes(self._trainer.target_network)
-            self._hash = weights_hash(self._weights)
-        self.episode, self._activity = turn.episode, "waiting"
+            self._weights, self._hash = weights, weights_hash(weights)
+        self._place, self._activity = Place(turn.episode, turn.lineage), "waiting"
         self._serve(announce=True)
 
-    def _reach(self, change: int) -> None:
+    def _reach(self, turn: Turn) -> None:
+        """Bring the mirror to a turn. Raises BusError, OtherTurn."""
         self._serve()
-        self._mirror.reach(self._me.bus, change)
+        followed = self._mirror.number
+        try:
+            self._mirror.reach(self._me.bus, turn.change, turn.lineage)
+        except BusError:
+            self._confirm(turn)
+            raise
+        reached = self._mirror.number
+        if reached != followed and (followed is None or reached != turn.change):
+            self._confirm(turn)  # a snapshot does not tell of which history it is
+
+    def _confirm(self, turn: Turn) -> None:
+        """Check that replay has a turn as it told. Raises BusError, OtherTurn."""
+        request = TurnsRequest(since=turn.episode - 1, limit=1)
+        if self._me.bus.request(TURNS, request, Turns).turns != (turn,):
+            raise OtherTurn(f"replay has another turn {turn.episode} than before: asking anew")
+
+    def _checked_weights(self) -> bytes:
+        """The target network as it is published. Raises FloatingPointError when it must not be."""
+        data = to_bytes(self._trainer.target_network)
+        try:
+            checked(self._trainer.target_network, data)
+        except ValueError as error:
+            raise FloatingPointError(f"not published: {error}") from error
+        return data
+
+    def _diverged(self, turn: Turn, error: Exception) -> StateError:
+        return StateError(
+            f"episode {turn.episode}: {error}; the checkpoint {self._path} is of the episode "
+            f"before and intact: lower learning.learning_rate in a new run"
+        )
 
     def _learn(self, turn: Turn) -> list[float]:
         """All mini-batches of this turn, answering requests in between; the losses.
@@ -150,10 +223,7 @@ class LearnerLoop:
                 if self._me.stop.is_set():
                     raise Stopped("training")
         except FloatingPointError as error:
-            raise StateError(
-                f"episode {turn.episode}: {error}; the checkpoint {self._path} is of the episode "
-                f"before and intact: lower learning.learning_rate in a new run"
-            ) from error
+            raise self._diverged(turn, error) from error
         return losses
 
     def _record(self, turn: Turn, mini_batches: int, seconds: float) -> None:
@@ -178,7 +248,7 @@ class LearnerLoop:
         return LearnerState(
             id="main",
             life=self._me.life,
-            episode=self.episode,
+            episode=self._place.episode,
             weights_version=trainer.version,
             weights_hash=self._hash,
             activity=self._activity,
@@ -188,7 +258,7 @@ class LearnerLoop:
             loss=self._loss,
             train_steps=trainer.train_steps,
             fits=trainer.fits,
-            target_age=self.episode - trainer.episode_at_copy,
+            target_age=self._place.episode - trainer.episode_at_copy,
             resyncs=self._mirror.resyncs,
             undecodable=self._inbox.refused_total,
         )

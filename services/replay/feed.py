@@ -25,13 +25,13 @@ class Feed:
         self._tables = tables
         self._listed: tuple[int, list[int]] | None = None
 
-    def note(self, txn: Txn, number: int, kind: Kind, what: Any) -> None:
-        """Write a change.
+    def note(self, txn: Txn, number: int, kind: Kind, what: Any, lineage: str) -> None:
+        """Write a change. `lineage` is that of the memory before it.
 
         what: of an append first insertion number and count, of a discard the insertion numbers as
         bytes, of rewards the column `REWARDS` as bytes.
         """
-        txn.put(key_of(number), pack([kind, what]), db=self._tables.db["changes"])
+        txn.put(key_of(number), pack([kind, what, lineage]), db=self._tables.db["changes"])
 
     def forget(self, txn: Txn, position: Position) -> None:
         """Delete old changes, and with a forgotten discard the samples it removed."""
@@ -41,40 +41,44 @@ class Feed:
                 number_of(cursor.key()) <= position.change - CHANGES_KEPT
                 or txn.stat(db["dead"])["entries"] > most_dead
             ):
-                kind, what = unpack(cursor.value())
+                kind, what, _ = unpack(cursor.value())
                 if kind == "discard":
                     for i in np.frombuffer(what, "<u8"):
                         for table in ("images", "samples", "dead"):
                             txn.delete(key_of(int(i)), db=db[table])
                 cursor.delete()
 
-    def changes(self, since: int, upto: int) -> Iterator[Change | FeedEnd]:
-        """Yield all changes in (since, upto] in parts of about 1 MB, then a `FeedEnd`."""
-        tables = self._tables
-        with tables.env.begin() as txn:
-            newest = tables.position(txn).change
-            upto = min(upto, newest)
-            with txn.cursor(tables.db["changes"]) as cursor:
-                oldest = number_of(cursor.key()) if cursor.first() else newest + 1
-            if (since < upto and since + 1 < oldest) or since > newest:
-                yield FeedEnd(change=since, rows=0, messages=0, gone=True)
+    def changes(self, since: int, upto: int, lineage: str) -> Iterator[Change | FeedEnd]:
+        """Yield all changes in (since, upto] in parts of about 1 MB, then a `FeedEnd`.
+
+        lineage: that of the mirror at `since`. With another one it is the mirror of another memory,
+        and no change fits it.
+        """
+        with self._tables.env.begin() as txn:
+            newest = self._tables.position(txn)
+            upto = max(min(upto, newest.change), since)
+            if self._lineage(txn, newest, since) != lineage:
+                yield FeedEnd(change=since, rows=0, messages=0, lineage=newest.lineage, gone=True)
                 return
             rows = messages = 0
             for number in range(since + 1, upto + 1):
                 for part in self._parts(txn, number):
                     rows, messages = rows + part.count, messages + 1
                     yield part
-            yield FeedEnd(change=max(upto, since), rows=rows, messages=messages)
+            reached = self._lineage(txn, newest, upto)
+            yield FeedEnd(change=upto, rows=rows, messages=messages, lineage=reached)
 
     def snapshot(self) -> Iterator[Change | FeedEnd]:
         """Yield the whole memory at the newest turn, from one read transaction."""
         with self._tables.env.begin() as txn:
-            number = self._tables.position(txn).change
+            newest = self._tables.position(txn)
             ids, messages = self._tables.alive(txn), 0
-            for part in self._appended(txn, number, ids, current=True):
+            for part in self._appended(txn, newest.change, ids, current=True):
                 messages += 1
                 yield part
-            yield FeedEnd(change=number, rows=len(ids), messages=messages)
+            yield FeedEnd(
+                change=newest.change, rows=len(ids), messages=messages, lineage=newest.lineage
+            )
 
     def mini_batch(self, size: int, draw: np.random.Generator) -> Change:
         """Return at most `size` samples without replacement, drawn by rank, with their rewards."""
@@ -85,6 +89,13 @@ class Feed:
             ids = sorted(alive[rank] for rank in ranks)
             return self._part(txn, number, ids, last=True, current=True)
 
+    def _lineage(self, txn: Txn, newest: Position, number: int) -> str:
+        """The lineage as of a change; empty if it is not kept, or if there is no such change."""
+        if number == newest.change:
+            return newest.lineage
+        data = txn.get(key_of(number + 1), db=self._tables.db["changes"])
+        return "" if data is None else str(unpack(data)[2])
+
     def _alive_at(self, txn: Txn, number: int) -> list[int]:
         """Return the insertion numbers after this change, kept for as long as nothing changes."""
         if self._listed is None or self._listed[0] != number:
@@ -93,7 +104,7 @@ class Feed:
 
     def _parts(self, txn: Txn, number: int) -> Iterator[Change]:
         """Yield the parts of a change that `note` wrote."""
-        kind, what = unpack(txn.get(key_of(number), db=self._tables.db["changes"]))
+        kind, what, _ = unpack(txn.get(key_of(number), db=self._tables.db["changes"]))
         if kind == "append":
             first, count = what
             yield from self._appended(txn, number, list(range(first, first + count)), current=False)

@@ -6,12 +6,18 @@ keeps them in a variable.
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
+
+import numpy as np
 
 from shared.config import MemoryConfig
 from shared.errors import StateError
 from shared.messages import Episode, RobotProgress
+
+MAX_ROBOTS = 256
+"""Robots that one memory keeps numbers of."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +32,8 @@ class RobotCounters:
     run_actions: int = 0
     """Actions of counted episodes since the newest bump or interruption (E43)."""
     longest_run_actions: int = 0
+    filled: bool = False
+    """It was told that the memory is full."""
 
 
 @dataclass(frozen=True)
@@ -91,12 +99,40 @@ def refill(counters: Counters, config: MemoryConfig, held: int) -> Counters:
     return replace(counters, filled=held) if filling(counters, config) else counters
 
 
-def refusal(counters: Counters, config: MemoryConfig, episode: Episode) -> str:
-    """Why a submission can never be accepted as it is; empty if it can."""
+def refusal(
+    counters: Counters, config: MemoryConfig, episode: Episode, newest_sequence: int = -1
+) -> str:
+    """Why a submission can never be accepted as it is, after its kind and a colon; empty if it can.
+
+    newest_sequence: `last_sequence` of what is stored of this robot and `robot_life`; -1 if nothing
+    is. The samples of a submission are of executed actions of one driver life, each sample of
+    another one, so at least as many numbers were used up as there are samples.
+    """
+    known = counters.robots.get(episode.robot)
+    if known is None and len(counters.robots) >= MAX_ROBOTS:
+        return f"robots: expected at most {MAX_ROBOTS}"
     if not episode.fill and filling(counters, config):
         missing = config.capacity - counters.filled
-        return f"the memory is being filled: {missing} samples missing, submit with fill = true"
+        return (
+            f"fill: the memory is being filled: {missing} samples missing, submit with fill = true"
+        )
+    if episode.fill and (config.fill == "none" or (known is not None and known.filled)):
+        return "fill: the memory is not being filled, submit with fill = false"
+    first = episode.last_sequence - episode.count + 1
+    if first <= newest_sequence:
+        return (
+            f"sequences: {episode.count} samples up to {episode.last_sequence} of robot life "
+            f"{episode.robot_life}, of which all up to {newest_sequence} are stored"
+        )
+    acted = int(np.frombuffer(episode.sample_versions, "<u4").max())
+    if acted > episode.weights_version:
+        return f"versions: weights {acted} acted, but {episode.weights_version} predicted"
     return ""
+
+
+def lineage_after(lineage: str, identity: str, digest: str) -> str:
+    """The lineage of a memory after one more submission: a hash over all of them, in order."""
+    return hashlib.sha256(f"{lineage} {identity} {digest}".encode()).hexdigest()[:16]
 
 
 def accept(counters: Counters, config: MemoryConfig, episode: Episode) -> tuple[Commit, Counters]:
@@ -122,6 +158,7 @@ def accept(counters: Counters, config: MemoryConfig, episode: Episode) -> tuple[
     run, length = bump_free(robot.run_actions, episode)
     robot = replace(
         robot,
+        filled=not filling(counters, config),
         life=episode.robot_life,
         last_sequence=episode.last_sequence,
         run_actions=run,

@@ -13,10 +13,11 @@ from pathlib import Path
 
 from services.processes import MAIN
 from services.replay.footprint import gather_heap
-from services.replay.numbering import Counters, filling, progress_of
-from services.replay.storage import Storage
+from services.replay.numbering import MAX_ROBOTS, Counters, filling, progress_of
+from services.replay.storage import Refused, Storage
 from services.replay.worker import TurnWorker
 from shared.bus import Request
+from shared.complaints import Complaints
 from shared.config import Config
 from shared.inbox import Inbox
 from shared.keys import (
@@ -43,6 +44,11 @@ from shared.messages import (
 from shared.rl.draws import generator
 from shared.service import TICK_S, Service, Stopped, service
 
+VERSION_PATIENCE_S = 60.0
+"""How long an episode of an unknown version is sent back to be sent again, at least."""
+HEARD_S = 10.0
+"""A learner that was heard no longer ago than this tells which versions there are."""
+
 
 def run(config: Config, folder: Path, life: str) -> None:
     """Keep the replay memory until stopped."""
@@ -67,6 +73,9 @@ class Intake:
         self._bulk_failure: BaseException | None = None
         self._counters = storage.counters()
         self._version = max(1, storage.newest_weights_version())
+        self._doubted: dict[tuple[str, int], float] = {}
+        """When a robot first sent an episode of a version that is not known."""
+        self._complaints = Complaints(me.log.warning)
         self.duplicates = 0
         self.refused = 0
         me.stop.on_set(self._inbox.wake)
@@ -107,10 +116,13 @@ class Intake:
     def _answer(self, request: Request) -> None:
         message = request.message
         if isinstance(message, Episode):
-            if message.weights_version > self._known_version():
+            if message.weights_version <= self._known_version():
+                request.reply(self._commit(message))
+            elif self._exists(message, time.monotonic()):
                 request.refuse(f"weights version {message.weights_version} is not known here yet")
             else:
-                request.reply(self._commit(message))
+                reason = f"weights_version: the learner has made no {message.weights_version}"
+                request.reply(self._refusal(message, reason))
         elif isinstance(message, ProgressRequest):
             request.reply(progress_of(self._counters, self._me.config.memory, message.robot))
         elif isinstance(message, TurnsRequest):
@@ -122,13 +134,32 @@ class Intake:
         self._version = max(self._version, newest)
         return self._version
 
+    def _exists(self, episode: Episode, now_s: float) -> bool:
+        """Whether the version of an episode may exist, though it is not known: for a while any may.
+
+        After that only what a learner that can be heard now does not contradict.
+        """
+        robot = (episode.robot, episode.weights_version)
+        if robot not in self._doubted and len(self._doubted) >= MAX_ROBOTS:
+            self._doubted.clear()
+        since_s = self._doubted.setdefault(robot, now_s)
+        announced, heard_s = self._worker.weights.heard
+        contradicted = announced < episode.weights_version and now_s - heard_s < HEARD_S
+        return now_s - since_s < VERSION_PATIENCE_S or not contradicted
+
+    def _refusal(self, episode: Episode, reason: str) -> EpisodeAck:
+        """Refuse a submission for good. The log has a line for each kind of reason and minute."""
+        self.refused += 1
+        what = f"{episode.robot}/{episode.life}/{episode.number}"
+        self._complaints.tell(reason.partition(":")[0], f"episode {what} is refused: {reason}")
+        return EpisodeAck(accepted=False, reason=reason)
+
     def _commit(self, episode: Episode) -> EpisodeAck:
         """Store one submission; when the answer goes out, it is on disk."""
         try:
             accepted = self._storage.commit(episode)
-        except ValueError as error:
-            self.refused += 1
-            return EpisodeAck(accepted=False, reason=str(error))
+        except Refused as error:
+            return self._refusal(episode, str(error))
         self._counters = accepted.counters
         self.duplicates += int(accepted.duplicate)
         self._worker.submitted()
@@ -151,12 +182,14 @@ class Intake:
             episode=counters.episode,
             turn=view.position.turn,
             turn_change=view.position.turn_change,
+            lineage=view.position.turn_lineage,
             size=sum(view.by_action),
             capacity=view.position.capacity,
             filling=filling(counters, memory),
             by_action=view.by_action,
             retention=tuple(Told(name=name, value=n) for name, n in view.retention.items()),
             weights_version=view.weights_version,
+            known_version=self._known_version(),
             activity=view.activity,
             progress=view.progress,
             fitness_mean_100=view.fitness_mean,
@@ -184,7 +217,7 @@ class Intake:
     def _stream(self, request: Request) -> None:
         message = request.message
         if isinstance(message, ChangesRequest):
-            for part in self._storage.feed.changes(message.since, message.upto):
+            for part in self._storage.feed.changes(message.since, message.upto, message.lineage):
                 request.reply(part)
         elif isinstance(message, SnapshotRequest):
             for part in self._storage.feed.snapshot():

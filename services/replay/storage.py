@@ -25,10 +25,17 @@ from services.replay.tables import (
     unpack,
 )
 from shared.config import MemoryConfig
-from shared.messages import Episode, Turn
+from shared.messages import NO_LINEAGE, Episode, Turn
 from shared.rl.memory import ReplayMemory
 from shared.rl.retention.strategy import columns
 from shared.rl.turn import Maintenance, sample_rows
+
+MAX_WORLDS = 1024
+"""Names of worlds that one memory keeps."""
+
+
+class Refused(ValueError):
+    """Why a submission can never be stored, after its kind and a colon."""
 
 
 @dataclass(frozen=True)
@@ -89,28 +96,46 @@ class Storage:
     def commit(self, episode: Episode) -> Accepted:
         """Write one submission, or recognise it as already written; on disk when this returns.
 
-        Raises ValueError with the reason when it cannot be accepted.
+        Raises Refused when it cannot be accepted.
         """
-        identity = f"{episode.robot}/{episode.life}/{episode.number}".encode()
+        identity = f"{episode.robot}/{episode.life}/{episode.number}"
+        summary, db = _summary(episode), self._tables.db
         with self._tables.env.begin(write=True) as txn:
             counters = Counters.from_dict(self._tables.meta(txn, "counters"))
-            known = txn.get(identity, db=self._tables.db["identity"])
+            known = txn.get(identity.encode(), db=db["identity"])
             if known is not None:
-                record = unpack(txn.get(known, db=self._tables.db["commits"]))
+                record = unpack(txn.get(known, db=db["commits"]))
+                if any(record[name] != value for name, value in summary.items()):
+                    raise Refused(f"identity: {identity} is stored with other content")
                 return Accepted(Commit(**record["commit"]), counters, duplicate=True)
-            reason = numbering.refusal(counters, self._config, episode)
-            if reason:
-                raise ValueError(reason)
+            driver = f"{episode.robot}/{episode.robot_life}".encode()
+            settled = txn.get(driver, db=db["lives"])
+            newest = -1 if settled is None else number_of(settled)
+            if reason := numbering.refusal(counters, self._config, episode, newest):
+                raise Refused(reason)
+            lineage = numbering.lineage_after(
+                self._lineage(txn, counters.commit), identity, summary["digest"]
+            )
             commit, counters = numbering.accept(counters, self._config, episode)
             self._write_samples(txn, episode, commit)
-            record = {"commit": asdict(commit), "totals": _totals(counters), **_summary(episode)}
-            txn.put(key_of(commit.commit), pack(record), db=self._tables.db["commits"])
-            txn.put(identity, key_of(commit.commit), db=self._tables.db["identity"])
+            record = {"commit": asdict(commit), "totals": _totals(counters), "lineage": lineage}
+            txn.put(key_of(commit.commit), pack(record | summary), db=db["commits"])
+            txn.put(identity.encode(), key_of(commit.commit), db=db["identity"])
+            txn.put(driver, key_of(episode.last_sequence), db=db["lives"])
             self._tables.put_meta(txn, "counters", counters.to_dict())
         return Accepted(commit, counters, duplicate=False)
 
+    def _lineage(self, txn: Txn, commit: int) -> str:
+        """The lineage as of a commit."""
+        if not commit:
+            return NO_LINEAGE
+        return str(unpack(txn.get(key_of(commit), db=self._tables.db["commits"]))["lineage"])
+
     def _write_samples(self, txn: Txn, episode: Episode, commit: Commit) -> None:
+        """Write the stored samples. Raises Refused for too many worlds."""
         worlds = list(self._tables.meta(txn, "worlds"))
+        if len({*worlds, *episode.worlds}) > MAX_WORLDS:
+            raise Refused(f"worlds: expected at most {MAX_WORLDS} names in one memory")
         rows, images = sample_rows(episode, worlds, commit)
         self._tables.put_meta(txn, "worlds", worlds)
         keys = [key_of(commit.first_id + i) for i in range(commit.stored)]
@@ -144,39 +169,57 @@ class Storage:
         commit, summary = submission.commit, submission.record
         with self._tables.env.begin(write=True) as txn:
             position = self._tables.position(txn)
-            number = position.change
-            if commit.stored:
-                number += 1
-                self.feed.note(txn, number, "append", [commit.first_id, commit.stored])
-            removed = done.discarded.ids
-            if len(removed):
-                number += 1
-                self.feed.note(txn, number, "discard", removed.astype("<u8").tobytes())
-                with txn.cursor(self._tables.db["dead"]) as cursor:
-                    cursor.putmulti([(key_of(int(i)), key_of(number)) for i in removed])
-            if done.equalised:
-                number += 1
-                column = _column(memory, REWARDS)
-                self.feed.note(txn, number, "rewards", column)
-                txn.put(b"rewards", column, db=self._tables.db["columns"])
+            number = self._write_changes(txn, position, submission, memory, done)
             if done.discarded.marked:
                 txn.put(b"marks", _column(memory, MARKS), db=self._tables.db["columns"])
-            turn, turn_change = position.turn, position.turn_change
+            lineage = summary["lineage"] if number > position.change else position.lineage
+            turn, change, turn_lineage = position.turn, position.turn_change, position.turn_lineage
             if commit.episode:
-                turn, turn_change = commit.episode, number
+                turn, change, turn_lineage = commit.episode, number, lineage
                 entry = {
                     "change": number,
                     **{name: summary[name] for name in ("bump", "actions")},
                     "total_actions": summary["totals"]["actions"],
                     "samples": commit.stored,
+                    "lineage": lineage,
                 }
                 txn.put(key_of(turn), pack(entry), db=self._tables.db["turns"])
             position = Position(
-                number, commit.commit, turn, turn_change, memory.capacity, memory.kept
+                *(number, commit.commit, turn, change, memory.capacity, memory.kept),
+                lineage=lineage,
+                turn_lineage=turn_lineage,
             )
             self._tables.put_meta(txn, "position", asdict(position))
             self.feed.forget(txn, position)
         return position
+
+    def _write_changes(
+        self,
+        txn: Txn,
+        position: Position,
+        submission: Submission,
+        memory: ReplayMemory,
+        done: Maintenance,
+    ) -> int:
+        """Note the changes of one turn; return the number of the last."""
+        commit, removed, number = submission.commit, done.discarded.ids, position.change
+        lineages = iter((position.lineage, *[submission.record["lineage"]] * 2))
+        if commit.stored:
+            number += 1
+            what = [commit.first_id, commit.stored]
+            self.feed.note(txn, number, "append", what, next(lineages))
+        if len(removed):
+            number += 1
+            ids = removed.astype("<u8").tobytes()
+            self.feed.note(txn, number, "discard", ids, next(lineages))
+            with txn.cursor(self._tables.db["dead"]) as cursor:
+                cursor.putmulti([(key_of(int(i)), key_of(number)) for i in removed])
+        if done.equalised:
+            number += 1
+            column = _column(memory, REWARDS)
+            self.feed.note(txn, number, "rewards", column, next(lineages))
+            txn.put(b"rewards", column, db=self._tables.db["columns"])
+        return number
 
     def turns(self, since: int, limit: int) -> tuple[Turn, ...]:
         """Turns after episode `since`, in order, without gaps, at most `limit`."""

@@ -7,9 +7,10 @@ commits   commit number -> record of the submission (provenance, metrics)
 identity  robot, life, number -> commit number: the deduplication
 images    insertion number -> bytes of the image
 samples   insertion number -> row (reward as inserted)
+lives     robot, driver life -> sequence of the newest action that a submission settled
 dead      insertion number -> change number of its discard; kept until the feed forgets the change
 columns   "rewards": all rewards after the newest equalisation; "marks": those of retention
-changes   change number -> kind and ids: the feed
+changes   change number -> kind, ids, lineage of the memory before: the feed
 turns     global episode number -> what the learner needs to know
 
 One write transaction commits an episode, another one applies a whole turn: a kill at any moment
@@ -32,15 +33,19 @@ from services.replay.numbering import Commit, Counters
 from shared.config import MemoryConfig
 from shared.errors import StateError
 from shared.facts import IMAGE_SHAPE
+from shared.messages import NO_LINEAGE
 from shared.rl.memory import SAMPLE
 from shared.rl.retention.strategy import columns
 
-SCHEMA = 5
+SCHEMA = 6
 MAP_BYTES = 1 << 38
 """Largest size of the file; only what is used exists."""
 REWARDS = np.dtype([("id", "<u8"), ("reward", "<f4")])
 MARKS = np.dtype([("id", "<u8"), *columns()])
-TABLES = ("meta", "commits", "identity", "images", "samples", "dead", "columns", "changes", "turns")
+TABLES = (
+    *("meta", "commits", "identity", "lives", "images", "samples"),
+    *("dead", "columns", "changes", "turns"),
+)
 Txn = Any
 
 
@@ -81,6 +86,10 @@ class Position:
     """N in force: it may have grown (A44)."""
     kept: dict[str, int] = field(default_factory=dict)
     """What strategies of retention keep from one discard to the next."""
+    lineage: str = NO_LINEAGE
+    """Of the memory as of `change`."""
+    turn_lineage: str = NO_LINEAGE
+    """Of the memory as of `turn_change`."""
 
 
 class Tables:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from typing import TYPE_CHECKING
+import json
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -23,6 +24,10 @@ POOLED = {"ccpccp": (False, True, False, True), "cpcccp": (True, False, False, T
 HIDDEN = 128
 """Units of FConn1 and of FConn3."""
 MAX_WEIGHT_BYTES = 64 * 1024 * 1024
+MAX_HEAD_BYTES = 64 * 1024
+"""What a file of weights may have beside its parameters."""
+SHAPE = "network"
+"""Where metadata of weights say what network they are of. One name: several have no fixed order."""
 
 
 def _map_size(size: int) -> int:
@@ -121,23 +126,59 @@ def channels_last(network: QNetwork) -> QNetwork:
     return network
 
 
+def shape_of(network: QNetwork) -> dict[str, Any]:
+    """What weights must fit beside the shapes of their tensors, which do not tell all of it."""
+    return {
+        "layout": network.layout,
+        "filters": network.conv1.out_channels,
+        "image": list(IMAGE_SHAPE),
+        "white": 255,
+        "actions": [list(action.vector) for action in ACTIONS],
+    }
+
+
 def to_bytes(network: QNetwork) -> bytes:
     """The parameters as safetensors bytes, float32, the same bytes for the same parameters."""
     tensors = {name: p.detach().cpu().contiguous() for name, p in network.state_dict().items()}
-    return save_safetensors(dict(sorted(tensors.items())))
+    shape = json.dumps(shape_of(network), sort_keys=True)
+    return save_safetensors(dict(sorted(tensors.items())), {SHAPE: shape})
 
 
 def load_bytes(network: QNetwork, data: bytes) -> None:
-    """Take over parameters from safetensors bytes after checking names, shapes, types, values.
+    """Take over parameters from safetensors bytes after checking them (`checked`).
 
     Raises ValueError and leaves the network as it was if anything does not fit.
     """
-    if len(data) > MAX_WEIGHT_BYTES:
-        raise ValueError(f"weights: at most {MAX_WEIGHT_BYTES} bytes, got {len(data)}")
+    tensors = checked(network, data, shaped=False)
+    with torch.no_grad():
+        for name, parameter in network.named_parameters():
+            parameter.copy_(tensors[name])
+
+
+def checked(network: QNetwork, data: bytes, *, shaped: bool = True) -> dict[str, Tensor]:
+    """The tensors in safetensors bytes, once size, names, shapes, types and values are right.
+
+    Args:
+        network: Has the names and shapes. Its own values do not matter.
+        data: Of one version of a network.
+        shaped: Also require that the metadata tell the shape of the network. They are compared in
+            any case; files that were written without them may still be read.
+
+    Raises:
+        ValueError: Something does not fit.
+    """
+    most = min(MAX_WEIGHT_BYTES, 4 * parameter_count(network) + MAX_HEAD_BYTES)
+    if len(data) > most:
+        raise ValueError(f"weights: at most {most} bytes, got {len(data)}")
     try:
         tensors = load_safetensors(data)
+        head = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+        told = head.get("__metadata__", {}).get(SHAPE)
+        shape = None if told is None else json.loads(told)
     except Exception as error:
         raise ValueError(f"weights: not safetensors: {error}") from error
+    if shape != shape_of(network) and (shaped or shape is not None):
+        raise ValueError(f"weights: expected those of {shape_of(network)}, got {shape!r:.200}")
     own = network.state_dict()
     if tensors.keys() != own.keys():
         odd = sorted(tensors.keys() ^ own.keys())
@@ -150,9 +191,7 @@ def load_bytes(network: QNetwork, data: bytes) -> None:
             )
         if not bool(torch.isfinite(tensor).all()):
             raise ValueError(f"weights: {name}: not finite")
-    with torch.no_grad():
-        for name, parameter in network.named_parameters():
-            parameter.copy_(tensors[name])
+    return tensors
 
 
 class WeightsHash:

@@ -229,8 +229,13 @@ def test_valid_lies_about_turns_and_weights_do_not_stop_learning(
     run = cluster.config.run.name
     state = cluster.replay()
     assert state is not None
-    lie = state.model_copy(update={"turn": state.turn + 1000, "turn_change": 0})
-    attacker.put(f"{run}/replay/main/state", encode(lie))
+    for lie in (
+        {"turn": state.turn + 1000, "turn_change": 0},
+        {"turn": 0, "lineage": "0" * 16},
+        {"lineage": "f" * 16},
+        {"known_version": 2**31 - 1},
+    ):
+        attacker.put(f"{run}/replay/main/state", encode(state.model_copy(update=lie)))
     attacker.put(f"{run}/robot/ghost/observation", encode(make_observation(0, robot="ghost")))
     learner = cluster.learner()
     assert learner is not None

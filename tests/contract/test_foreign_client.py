@@ -284,7 +284,7 @@ def episode(number: int, *, count: int = 3, fill: bool = True, version: int = 1)
         sample_worlds=bytes(count),
         positions=struct.pack(f"<{3 * count}f", *[0.0] * 3 * count),
         robot_life=LIFE,
-        last_sequence=count - 1,
+        last_sequence=count * (number + 1) - 1,
     )
 
 
@@ -301,6 +301,9 @@ def test_foreign_episode_is_acknowledged_once_however_often_sent(
     early = client.ask("replay/main/episode/cube", episode(2, fill=False))[0]
     assert early["accepted"] is False
     assert "being filled" in early["reason"]
+    other = client.ask("replay/main/episode/cube", episode(1, count=2))[0]
+    assert (other["accepted"], other["duplicate"]) == (False, False)
+    assert "stored with other content" in other["reason"]
     assert client.refusals("replay/main/episode/cube", episode(3, version=99))
     cluster.kill("replay")
     cluster.start("replay")
@@ -310,17 +313,22 @@ def test_foreign_episode_is_acknowledged_once_however_often_sent(
 
 def test_foreign_learner_mirrors_the_memory_and_is_heard(cluster: Cluster, client: Client) -> None:
     cluster.start("replay")
-    for number in range(135):
+    for number in range(134):
         assert client.ask("replay/main/episode/cube", episode(number))[0]["accepted"]
-    done = client.ask("replay/main/episode/cube", episode(135, fill=False))[0]
+    assert not client.ask("replay/main/episode/cube", episode(134))[0]["accepted"]  # it was told
+    done = client.ask("replay/main/episode/cube", episode(134, fill=False))[0]
     assert done["episode"] == 1
     weights = b"\x02\x00\x00\x00\x00\x00\x00\x00{}"
     digest = hashlib.sha256(weights).hexdigest()[:16]
-    cluster.wait(lambda: (s := cluster.replay()) is not None and s.commit == 136, 20, "commits")
+    cluster.wait(lambda: (s := cluster.replay()) is not None and s.commit == 135, 20, "commits")
     *parts, end = client.ask("replay/main/snapshot", pack("SnapshotRequest"))
     assert end["t"] == "FeedEnd"
     assert end["rows"] == sum(len(part["ids"]) // 8 for part in parts)
     assert end["messages"] == len(parts)
+    for lineage in (end["lineage"], "f" * 16):
+        request = pack("ChangesRequest", since=end["change"], upto=end["change"], lineage=lineage)
+        (followed,) = client.ask("replay/main/changes", request)
+        assert followed["gone"] == (lineage != end["lineage"])
     state = pack(
         "LearnerState",
         id="main",

@@ -80,7 +80,7 @@ def store_and_mirror(called: dict[str, int], folder: Path) -> None:
     class FeedBus:
         def request_many(self, _: Any, request: Any, *types: Any, timeout_s: float) -> Any:
             if hasattr(request, "since"):
-                return storage.feed.changes(request.since, request.upto)
+                return storage.feed.changes(request.since, request.upto, request.lineage)
             return storage.feed.snapshot()
 
     def turn(number: int) -> None:
@@ -90,7 +90,7 @@ def store_and_mirror(called: dict[str, int], folder: Path) -> None:
         memory.append(pending.rows, pending.images)
         done = maintain(memory, Moment(number), config, FakePredictor(), seed=1)
         position = storage.apply_turn(pending, memory, done)
-        mirror.reach(FeedBus(), position.change)  # type: ignore[arg-type]
+        mirror.reach(FeedBus(), position.change, position.lineage)  # type: ignore[arg-type]
 
     config = MemoryConfig(capacity=30, fill="none", strategy="normm")
     storage, mirror = Storage(folder, config, "run/1"), Mirror()

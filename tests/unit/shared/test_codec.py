@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+import tracemalloc
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgpack
@@ -266,7 +267,7 @@ def test_fields_may_come_in_any_order_and_defaults_may_be_left_out() -> None:
 
 
 def test_one_of_several_types_is_told_by_its_name() -> None:
-    end = m.FeedEnd(change=1, rows=2, messages=3)
+    end = m.FeedEnd(change=1, rows=2, messages=3, lineage="0" * 16)
     assert decode(encode(end), m.Change, m.FeedEnd) == end
     with pytest.raises(BadMessage, match="Change or FeedEnd"):
         decode(encode(m.WeightsRequest()), m.Change, m.FeedEnd)
@@ -344,7 +345,7 @@ def test_deep_nesting_is_refused_wherever_it_hides(depth: int, place: str) -> No
 
 
 @pytest.mark.parametrize(
-    "version", [0, 1, 3, -1, None, "2", b"2", True, 2.0, (2,), 2**63, "x" * 100_000]
+    "version", [0, 1, 3, -1, None, "2", b"2", True, 2.0, (2,), 2**63, "x" * 4096]
 )
 def test_another_protocol_version_is_refused(version: Any) -> None:
     text = refused({**fields_of(m.WeightsRequest()), "v": version}, m.WeightsRequest)
@@ -358,7 +359,7 @@ def test_a_message_without_version_or_type_is_refused() -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["Action", "Message", "", "observation", None, 5, ("a",), "x" * 1_000_000, "a\nb", "__v"],
+    ["Action", "Message", "", "observation", None, 5, ("a",), "x" * 4096, "a\nb", "__v"],
 )
 def test_another_type_is_refused(name: Any) -> None:
     assert "got type" in refused({**fields_of(make_observation(1)), "t": name}, m.Observation)
@@ -399,10 +400,8 @@ def test_a_value_of_another_type_is_refused_in_every_field(cls: type[m.Message])
             wrong += ["", "text", [1, 2]]
         for value in wrong:
             text = complaint(msgpack.packb({**fields, name: value}), cls)
-            shaped = any(
-                hasattr(item, "pattern") or hasattr(item, "min_length") for item in field.metadata
-            )
-            free = accepted in ("<class 'str'>", "<class 'bytes'>") and not shaped
+            limits = limits_of(field.metadata).keys()
+            free = accepted in ("<class 'str'>", "<class 'bytes'>") and limits <= {"max_length"}
             assert name in text or (free and type(value).__name__ in accepted), (name, value)
 
 
@@ -572,3 +571,85 @@ def test_a_change_of_the_world_names_exactly_what_its_kind_needs(
     assert complaint in refused(
         {"v": m.PROTOCOL_VERSION, "t": "WorldChange", **fields}, m.WorldChange
     )
+
+
+# ------------------------------------------------------------------------- what it may cost
+
+MIB = 1024 * 1024
+
+
+def nested(depth: int, width: int, inner: bytes) -> bytes:
+    """Arrays of `width` arrays, `depth` deep."""
+    return inner if not depth else array(width) + nested(depth - 1, width, inner) * width
+
+
+def array(length: int) -> bytes:
+    return b"\xdd" + length.to_bytes(4, "big")
+
+
+GREEDY = {
+    "empty maps": array(24 * MIB) + b"\x80" * (24 * MIB),
+    "empty arrays": array(24 * MIB) + b"\x90" * (24 * MIB),
+    "numbers": array(5 * MIB) + b"\xce\xff\xff\xff\xff" * (5 * MIB - 1),
+    "arrays of arrays": nested(3, 250, b"\x80"),
+    "as a field": b"\x82\xa1v\x02\xa1t" + nested(3, 250, b"\x90"),
+    "arrays announced inside arrays": array(2**31) * 900,
+    "a map of many": b"\xdf\x00\x40\x00\x00" + b"\xa1a\x80" * (4 * MIB),
+    "long names": b"\x81\xdb" + (20 * MIB).to_bytes(4, "big") + b"\xf0\x9f\x98\x80" * (5 * MIB),
+    "an extension": b"\x81\xa1v\xc9" + (20 * MIB).to_bytes(4, "big") + b"\x05" + bytes(20 * MIB),
+}
+
+
+@pytest.mark.parametrize("name", GREEDY)
+def test_no_message_takes_much_more_memory_than_its_bytes(name: str) -> None:
+    """24 MiB of empty maps would be 1.6 GB of them."""
+    data = GREEDY[name]
+    assert len(data) <= 25 * MIB
+    tracemalloc.start()
+    try:
+        refused(data, m.Episode)
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert most < 4 * MIB + 2 * len(data)
+    if name not in ("an extension", "long names"):
+        assert most < 16 * MIB
+
+
+def test_the_largest_messages_are_within_the_limits() -> None:
+    turn, told = message(m.Turn), m.Told(name="x" * 64, value=1)
+    turns = m.Turns(turns=(turn,) * 1000)
+    state = message(m.ReplayState, by_action=(1, 2, 3), retention=(told,) * 64)
+    ack = m.EpisodeAck(accepted=False, reason="\N{GRINNING FACE}" * 1000)
+    for some in (turns, state, ack, make_episode(5000, worlds=tuple(f"w{i}" for i in range(64)))):
+        assert decode(encode(some), type(some)) == some
+
+
+@pytest.mark.parametrize(
+    ("cls", "field", "value"),
+    [
+        (m.Episode, "weights_version", 2**32),
+        (m.Episode, "positions", np.array([1e7, 0, 0], "<f4").tobytes()),
+        (m.EpisodeAck, "reason", "x" * 1001),
+        (m.RobotProgress, "robot_episodes", 2**32),
+        (m.RobotProgress, "robot_fills", 2**32),
+        (m.RobotProgress, "robot_life", "x"),
+        (m.Told, "name", "x" * 65),
+        (m.ReplayState, "known_version", 2**32),
+        (m.ReplayState, "fitness_mean_100", 1e300),
+        (m.ReplayState, "fitness_mean_100", -1.0),
+        (m.ReplayState, "lineage", "x" * 16),
+        (m.Turn, "lineage", "0" * 15),
+        (m.LearnerState, "weights_version", 2**32),
+        (m.LearnerState, "loss", -0.5),
+        (m.LearnerState, "loss", 1e39),
+        (m.Weights, "version", 2**32),
+        (m.Weights, "part", 64),
+        (m.Weights, "data", bytes(4 * MIB + 1)),
+    ],
+)
+def test_values_beyond_what_is_possible_are_refused(
+    cls: type[m.Message], field: str, value: Any
+) -> None:
+    good = make_episode(1) if cls is m.Episode else plain(cls)
+    assert field in refused({**fields_of(good), field: value}, cls)

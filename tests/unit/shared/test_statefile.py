@@ -27,8 +27,9 @@ def test_values_that_are_kept_can_be_read_again_and_again(tmp_path: Path) -> Non
     statefile.save(path, STATE)
     assert statefile.read(path) == statefile.read(path) == STATE
     path.write_bytes(b"\xc1")
-    with pytest.raises(StateError, match="damaged"):
+    with pytest.raises(StateError, match=r"damaged.*kept\.unreadable-1 now"):
         statefile.read(path)
+    assert path.with_name("kept.unreadable-1").read_bytes() == b"\xc1"
 
 
 def test_a_later_state_takes_the_place_of_an_earlier_one(tmp_path: Path) -> None:
@@ -91,6 +92,24 @@ def test_a_damaged_file_is_told_as_such_and_not_met_twice(tmp_path: Path, data: 
     with pytest.raises(StateError, match="damaged saved state"):
         statefile.take(path)
     assert statefile.take(path) is None
+    path.write_bytes(data)
+    with pytest.raises(StateError, match=r"it lies at .*state\.unreadable-2 now"):
+        statefile.take(path)
+    aside = sorted(tmp_path.iterdir())
+    assert [p.name for p in aside] == ["state.unreadable-1", "state.unreadable-2"]
+    assert {p.read_bytes() for p in aside} == {data}
+
+
+def test_what_was_taken_is_gone_on_disk_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without this a power cut brings a state back that somebody has gone on from."""
+    path = tmp_path / "state"
+    statefile.save(path, STATE)
+    synced: list[bool] = []
+    monkeypatch.setattr(statefile.os, "fsync", lambda _: synced.append(path.exists()))
+    assert statefile.take(path) == STATE
+    assert synced == [False]
 
 
 def test_a_file_too_large_is_refused_unread(
@@ -101,4 +120,4 @@ def test_a_file_too_large_is_refused_unread(
     monkeypatch.setattr(statefile, "LIMIT_BYTES", 10)
     with pytest.raises(StateError, match="at most 10 bytes"):
         statefile.take(path)
-    assert path.exists()
+    assert [p.name for p in tmp_path.iterdir()] == ["state.unreadable-1"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from safetensors import safe_open
 from safetensors.torch import save
 
 from services.learner import checkpoint
+from services.learner.history import Place
 from shared.config import LearningConfig, NetworkConfig, Numerics
 from shared.errors import StateError
 from shared.rl.learning import Trainer
@@ -56,7 +58,7 @@ def written(tmp_path: Path) -> tuple[Path, Trainer]:
 def test_a_restored_trainer_continues_bit_for_bit(written: tuple[Path, Trainer]) -> None:
     path, trainer = written
     resumed = make_trainer()
-    assert checkpoint.read(path, resumed, IDENTITY) == 3
+    assert checkpoint.read(path, resumed, IDENTITY).episode == 3
     assert state(resumed) == state(trainer)
     train(trainer, range(4, 7))
     train(resumed, range(4, 7))
@@ -67,7 +69,7 @@ def test_an_untrained_trainer_can_be_saved_too(tmp_path: Path) -> None:
     path, trainer = tmp_path / "checkpoint", make_trainer()
     checkpoint.write(path, trainer, 0, IDENTITY)
     resumed = make_trainer()
-    assert checkpoint.read(path, resumed, IDENTITY) == 0
+    assert checkpoint.read(path, resumed, IDENTITY).episode == 0
     train(trainer, range(1, 4))
     train(resumed, range(1, 4))
     assert state(resumed) == state(trainer)
@@ -76,7 +78,7 @@ def test_an_untrained_trainer_can_be_saved_too(tmp_path: Path) -> None:
 def test_without_a_file_the_trainer_stays_as_it_is(tmp_path: Path) -> None:
     trainer = make_trainer()
     before = state(trainer)
-    assert checkpoint.read(tmp_path / "none", trainer, IDENTITY) == 0
+    assert checkpoint.read(tmp_path / "none", trainer, IDENTITY).episode == 0
     assert state(trainer) == before
 
 
@@ -84,18 +86,18 @@ def test_the_newer_checkpoint_takes_the_place_of_the_older(written: tuple[Path, 
     path, trainer = written
     train(trainer, range(4, 5))
     checkpoint.write(path, trainer, 4, IDENTITY)
-    assert checkpoint.read(path, make_trainer(), IDENTITY) == 4
-    assert [p.name for p in path.parent.iterdir()] == [path.name]
+    assert checkpoint.read(path, make_trainer(), IDENTITY).episode == 4
+    assert sorted(p.name for p in path.parent.iterdir()) == [path.name, f"{path.name}.previous"]
 
 
 def test_a_half_written_newer_file_is_ignored(written: tuple[Path, Trainer]) -> None:
     path, trainer = written
     path.with_name(path.name + ".new").write_bytes(path.read_bytes()[:1000])
     resumed = make_trainer()
-    assert checkpoint.read(path, resumed, IDENTITY) == 3
+    assert checkpoint.read(path, resumed, IDENTITY).episode == 3
     assert state(resumed) == state(trainer)
     checkpoint.write(path, trainer, 4, IDENTITY)
-    assert checkpoint.read(path, make_trainer(), IDENTITY) == 4
+    assert checkpoint.read(path, make_trainer(), IDENTITY).episode == 4
 
 
 def test_a_checkpoint_of_another_run_is_refused(written: tuple[Path, Trainer]) -> None:
@@ -161,3 +163,65 @@ def test_a_missing_tensor_is_told_by_its_name(written: tuple[Path, Trainer], nam
     path.write_bytes(save(tensors, header))
     with pytest.raises(StateError, match=name.replace(".", r"\.")):
         checkpoint.read(path, make_trainer(), IDENTITY)
+
+
+# ------------------------------------------------------------------------- what goes wrong
+
+
+def test_the_lineage_comes_back_and_an_older_file_has_none(written: tuple[Path, Trainer]) -> None:
+    path, trainer = written
+    checkpoint.write(path, trainer, 4, IDENTITY, "ab" * 8)
+    assert checkpoint.read(path, make_trainer(), IDENTITY) == Place(4, "ab" * 8)
+    with safe_open(path, framework="pt") as file:
+        header = json.loads(file.metadata()["state"])
+    del header["lineage"]
+    tensors = {name: t.contiguous() for name, t in trainer.tensors().items()}
+    path.write_bytes(save(tensors, {"state": json.dumps(header)}))
+    assert checkpoint.read(path, make_trainer(), IDENTITY) == Place(4, "")
+
+
+@pytest.mark.parametrize("name", ["train.out.bias", "target.conv1.weight", "square_avg.out.bias"])
+def test_numbers_that_are_not_finite_leave_the_last_good_checkpoint(
+    written: tuple[Path, Trainer], name: str
+) -> None:
+    path, trainer = written
+    before = path.read_bytes()
+    with torch.no_grad():
+        trainer.tensors()[name].view(-1)[0] = math.nan
+    with pytest.raises(FloatingPointError, match=f"{name} is not finite"):
+        checkpoint.write(path, trainer, 4, IDENTITY)
+    assert path.read_bytes() == before
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+    tensors = {n: t.contiguous() for n, t in trainer.tensors().items()}
+    with safe_open(path, framework="pt") as file:
+        header = file.metadata()
+    path.write_bytes(save(tensors, header))
+    with pytest.raises(checkpoint.Damaged, match=f"{name} is not finite"):
+        checkpoint.read(path, make_trainer(), IDENTITY)
+
+
+def test_an_unreadable_checkpoint_is_kept_and_the_one_before_taken(
+    written: tuple[Path, Trainer],
+) -> None:
+    path, trainer = written
+    checkpoint.write(path, trainer, 4, IDENTITY)
+    path.write_bytes(path.read_bytes()[:-1])
+    damaged = path.read_bytes()
+    with pytest.raises(
+        StateError, match=r"damaged.*unreadable-1 now, and the next start goes on from the one bef"
+    ):
+        checkpoint.take_up(path, make_trainer(), IDENTITY)
+    assert path.with_name(f"{path.name}.unreadable-1").read_bytes() == damaged
+    assert checkpoint.take_up(path, make_trainer(), IDENTITY).episode == 3
+    path.write_bytes(b"")
+    with pytest.raises(StateError, match=r"unreadable-2 now, and the next start begins with new"):
+        checkpoint.take_up(path, make_trainer(), IDENTITY)
+    assert checkpoint.take_up(path, make_trainer(), IDENTITY) == Place()
+    assert path.with_name(f"{path.name}.unreadable-1").read_bytes() == damaged
+
+
+def test_a_checkpoint_of_another_run_stays_where_it_is(written: tuple[Path, Trainer]) -> None:
+    path, _ = written
+    with pytest.raises(StateError, match="run2"):
+        checkpoint.take_up(path, make_trainer(), "run2/0123456789abcdef")
+    assert [p.name for p in path.parent.iterdir()] == [path.name]

@@ -68,7 +68,6 @@ def test_an_episode_before_the_memory_is_full_is_refused_with_what_is_missing() 
     assert refusal(counters, CONFIG, make_episode(3, fill=True)) == ""
     _, counters = after(CONFIG, make_episode(30, fill=True))
     assert refusal(counters, CONFIG, make_episode(3)) == ""
-    assert refusal(counters, CONFIG, make_episode(3, fill=True)) == ""
 
 
 def test_robots_share_the_global_number_and_keep_their_own() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +22,7 @@ from services.replay.storage import Storage
 from shared.config import MemoryConfig
 from shared.errors import PeerSilent, StateError
 from shared.keys import CHANGES
-from shared.messages import Change, Episode, FeedEnd
+from shared.messages import NO_LINEAGE, Change, Episode, FeedEnd
 from shared.rl.draws import generator
 from shared.rl.memory import SampleStore
 from shared.rl.schedule import Moment
@@ -55,6 +56,10 @@ class Bench:
         self.episodes = 0
         self.commits = 0
         self.seen: dict[int, list[tuple[Any, ...]]] = {0: []}
+        self.history = [NO_LINEAGE]
+        """Lineage after each commit."""
+        self.lineages = {0: NO_LINEAGE}
+        """Lineage as of each change."""
 
     def reopen(self) -> None:
         """What a kill -9 and a restart do: memory is read from disk, open turns come again."""
@@ -65,6 +70,7 @@ class Bench:
     def commit(self, episode: Episode) -> None:
         accepted = self.storage.commit(episode)
         self.commits += 1
+        self.history.append(chained(self.history[-1], episode))
         stored = episode.count
         if episode.fill:
             stored = min(stored, self.config.capacity - self.filled)
@@ -84,11 +90,18 @@ class Bench:
         if pending is None:
             return False
         commit, rows, images = pending.commit, pending.rows, pending.images
+        before = self.change
         self.memory.append(rows, images)
         predictor: Any = FakePredictor(self.version)
         done = maintain(self.memory, Moment(commit.episode), self.config, predictor, seed=1)
         position = self.storage.apply_turn(pending, self.memory, done)
         self._model_turn(rows, images, commit.episode)
+        for number in range(before + 1, self.change + 1):
+            self.lineages[number] = self.history[commit.commit]
+        assert position.lineage == self.lineages[self.change]
+        if commit.episode:
+            (turn,) = self.storage.turns(commit.episode - 1, 1)
+            assert turn.lineage == position.turn_lineage == position.lineage
         assert (position.change, position.kept["threshold_percent"]) == (self.change, self.percent)
         assert position.capacity == self.capacity
         assert position.processed == commit.commit
@@ -156,6 +169,12 @@ class Bench:
         same_samples(loaded, self.seen[self.change])
         for s, reward in zip(self.model, loaded.rows["reward"].tolist(), strict=True):
             s["reward"] = reward
+
+
+def chained(lineage: str, episode: Episode) -> str:
+    """The lineage after one more submission, as docs/protocol.md tells it."""
+    name = f"{episode.robot}/{episode.life}/{episode.number}"
+    return hashlib.sha256(f"{lineage} {name} {episode.digest}".encode()).hexdigest()[:16]
 
 
 def same_samples(store: SampleStore, expected: list[tuple[Any, ...]]) -> None:
@@ -237,8 +256,9 @@ def test_disk_memory_and_mirror_hold_what_the_rules_say_over_restarts(
             elif event == "new weights":
                 b.version += 1
             elif event == "mirror":
-                parts, end = pulled(b.storage.feed.changes(at, b.change))
+                parts, end = pulled(b.storage.feed.changes(at, b.change, b.lineages[at]))
                 assert (end.change, end.gone) == (b.change, False)
+                assert end.lineage == b.lineages[b.change]
                 for part in parts:
                     apply(mirror, part)
                     if part.last:
@@ -260,6 +280,7 @@ def test_disk_memory_and_mirror_hold_what_the_rules_say_over_restarts(
                             fill=filling,
                             worlds=(world,),
                             life=life,
+                            last_sequence=10_000 * (2 * number + part) + size,
                         )
                     )
                 if event == "two commits":
@@ -272,7 +293,7 @@ def test_disk_memory_and_mirror_hold_what_the_rules_say_over_restarts(
         snapshot = SampleStore()
         for part in parts:
             apply(snapshot, part)
-        assert end.change == b.change
+        assert (end.change, end.lineage) == (b.change, b.lineages[b.change])
         same_samples(snapshot, b.seen[b.change])
 
 
@@ -295,7 +316,8 @@ def test_a_repeated_submission_is_recognised_even_after_a_restart() -> None:
 def test_another_robot_life_or_number_is_another_submission(other: dict[str, Any]) -> None:
     with bench() as b:
         b.storage.commit(make_episode(5, seed=3))
-        assert not b.storage.commit(make_episode(5, seed=3, **other)).duplicate
+        second = make_episode(5, seed=3, last_sequence=40_000, **other)
+        assert not b.storage.commit(second).duplicate
 
 
 def test_a_refused_submission_leaves_no_trace() -> None:
@@ -310,7 +332,8 @@ def test_a_refused_submission_leaves_no_trace() -> None:
 def test_the_memory_starts_with_exactly_n_samples() -> None:
     with bench(fill="random") as b:
         for seed in range(5):
-            b.commit(make_episode(13, seed=seed, images=some_images(13, seed), fill=True))
+            images = some_images(13, seed)
+            b.commit(make_episode(13, seed=seed, images=images, fill=True, robot=f"robot{seed}"))
             assert b.turn()
             b.check()
         assert len(b.memory) == 30
@@ -463,7 +486,7 @@ def test_a_large_episode_comes_in_parts_of_one_change() -> None:
     with bench(capacity=2000) as b:
         b.commit(make_episode(600, seed=1, images=some_images(600, 1)))
         b.turn()
-        parts, _ = pulled(b.storage.feed.changes(0, 1))
+        parts, _ = pulled(b.storage.feed.changes(0, 1, NO_LINEAGE))
         assert [len(p.ids) // 8 for p in parts] == [256, 256, 88]
         assert [p.last for p in parts] == [False, False, True]
         assert {p.number for p in parts} == {1}
@@ -473,13 +496,13 @@ def test_a_large_episode_comes_in_parts_of_one_change() -> None:
 
 def test_nothing_new_and_nothing_at_all() -> None:
     with bench() as b:
-        parts, end = pulled(b.storage.feed.changes(0, 0))
+        parts, end = pulled(b.storage.feed.changes(0, 0, NO_LINEAGE))
         assert (parts, end.change, end.gone) == ([], 0, False)
         parts, end = pulled(b.storage.feed.snapshot())
         assert (parts, end.change) == ([], 0)
         b.commit(make_episode(3))
         b.turn()
-        parts, end = pulled(b.storage.feed.changes(1, 1))
+        parts, end = pulled(b.storage.feed.changes(1, 1, b.lineages[1]))
         assert (parts, end.change, end.gone) == ([], 1, False)
 
 
@@ -487,9 +510,11 @@ def test_asking_beyond_the_newest_change_gives_the_newest() -> None:
     with bench() as b:
         b.commit(make_episode(3))
         b.turn()
-        parts, end = pulled(b.storage.feed.changes(0, 99))
+        parts, end = pulled(b.storage.feed.changes(0, 99, NO_LINEAGE))
         assert (len(parts), end.change) == (1, 1)
-        assert pulled(b.storage.feed.changes(5, 9))[1].gone  # a mirror of another life of this run
+        assert pulled(b.storage.feed.changes(5, 9, b.lineages[1]))[
+            1
+        ].gone  # a mirror of another life of this run
 
 
 def test_forgotten_changes_are_gone_and_their_samples_deleted(
@@ -503,7 +528,7 @@ def test_forgotten_changes_are_gone_and_their_samples_deleted(
             b.check()
         newest = b.change
         for since in range(newest + 1):
-            parts, end = pulled(b.storage.feed.changes(since, newest))
+            parts, end = pulled(b.storage.feed.changes(since, newest, b.lineages[since]))
             assert end.gone == (since < newest - 6)
             if not end.gone:
                 mirror = SampleStore()
@@ -565,7 +590,7 @@ class ScriptedBus:
         self.asked.append(stream.name)
         storage = self.bench.storage
         if stream is CHANGES:
-            replies = list(storage.feed.changes(request.since, request.upto))
+            replies = list(storage.feed.changes(request.since, request.upto, request.lineage))
         else:
             replies = list(storage.feed.snapshot())
         if self.lost is not None:
@@ -585,12 +610,12 @@ def test_a_mirror_follows_change_by_change_and_resynchronises_after_a_gap(
             b.turn()
             b.check()
             if seed not in (5, 6, 7):
-                mirror.reach(any_bus, b.change)
+                mirror.reach(any_bus, b.change, b.lineages[b.change])
                 assert mirror.number == b.change
                 same_samples(mirror.samples, b.seen[b.change])
         assert bus.asked == ["snapshot"] + ["changes"] * 5 + ["snapshot"]
         assert mirror.resyncs == 1
-        mirror.reach(any_bus, b.change - 1)
+        mirror.reach(any_bus, b.change - 1, b.lineages[b.change - 1])
         assert len(bus.asked) == 7
 
 
@@ -603,15 +628,15 @@ def test_a_broken_transfer_leaves_the_mirror_at_a_complete_change(lost: int) -> 
         b.turn()
         bus.lost = lost
         with pytest.raises(PeerSilent):
-            mirror.reach(any_bus, b.change)
+            mirror.reach(any_bus, b.change, b.lineages[b.change])
         assert mirror.number is None
         bus.lost = None
-        mirror.reach(any_bus, b.change)
+        mirror.reach(any_bus, b.change, b.lineages[b.change])
         standing = b.change
         b.commit(make_episode(20, seed=2, images=some_images(20, 2)))
         b.turn()
         bus.lost = lost
         with pytest.raises(PeerSilent):
-            mirror.reach(any_bus, b.change)
+            mirror.reach(any_bus, b.change, b.lineages[b.change])
         assert mirror.number == standing
         same_samples(mirror.samples, b.seen[standing])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 from typing import Literal
 
@@ -17,6 +18,7 @@ from shared.rl.engine import network_input
 from shared.rl.network import (
     QNetwork,
     WeightsHash,
+    checked,
     initialised,
     load_bytes,
     parameter_count,
@@ -228,6 +230,45 @@ def test_bad_weights_are_refused_and_leave_the_network_as_it_was(kind: str) -> N
     with pytest.raises(ValueError, match="weights: "):
         load_bytes(network, damaged(kind))
     assert to_bytes(network) == before
+
+
+def test_weights_say_what_network_they_are_of_and_another_one_refuses_them() -> None:
+    """Both layouts have the same tensors, and mean something else by them."""
+    data = to_bytes(make_network(SMALL))
+    twin = QNetwork(SMALL.model_copy(update={"layout": "cpcccp"}))
+    assert twin.state_dict().keys() == make_network(SMALL).state_dict().keys()
+    for take in (load_bytes, checked):
+        with pytest.raises(ValueError, match=r"weights: expected those of .*cpcccp.*got .*ccpccp"):
+            take(twin, data)
+    told = json.loads(safetensors_metadata(data)["network"])
+    assert told == {
+        "actions": [[1, 0, 0], [1, 1, 0], [1, 0, 1]],
+        "filters": SMALL.filters,
+        "image": [50, 75],
+        "layout": "ccpccp",
+        "white": 255,
+    }
+
+
+def safetensors_metadata(data: bytes) -> dict[str, str]:
+    header: dict[str, dict[str, str]] = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+    return header["__metadata__"]
+
+
+def test_files_without_metadata_can_be_read_but_are_not_taken_from_the_bus() -> None:
+    network, data = make_network(SMALL, 1), save(tensors())
+    load_bytes(network, data)
+    with pytest.raises(ValueError, match=r"weights: expected those of .*, got None"):
+        checked(network, data)
+
+
+def test_a_check_needs_names_and_shapes_only_and_changes_nothing() -> None:
+    with torch.device("meta"):
+        hollow = QNetwork(SMALL)
+    found = checked(hollow, to_bytes(make_network(SMALL, 1)))
+    assert found.keys() == hollow.state_dict().keys()
+    with pytest.raises(ValueError, match="weights: at most"):
+        checked(hollow, to_bytes(make_network(SMALL, 1)) + bytes(70_000))
 
 
 def test_too_many_bytes_are_refused_unread(monkeypatch: pytest.MonkeyPatch) -> None:
