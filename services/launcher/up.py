@@ -69,7 +69,7 @@ def run_all(
         credentials = Path(bus.credentials).absolute() if bus.credentials else ""
         (folder / "endpoint").write_text(f"{endpoint}\n{credentials}\n")
         _log_to(folder / "logs")
-        specs = child_specs(config, stored, folder, own, insecure=insecure)
+        specs = child_specs(config, stored, folder, own)
         environment = {k: v for k, v in os.environ.items() if not k.startswith(settings.ENV_PREFIX)}
         supervisor = Supervisor(specs, folder / "logs", environment, [lock])
         ending = supervise(config, supervisor, stop)
@@ -129,14 +129,14 @@ def _view(
     )
 
 
-def child_specs(
-    config: Config, stored: Config, folder: Path, own: str | None, *, insecure: bool = False
-) -> list[ChildSpec]:
+def child_specs(config: Config, stored: Config, folder: Path, own: str | None) -> list[ChildSpec]:
     """The processes of a run: our router if `own` tells where it listens, and all services."""
     specs = []
     if own is not None:
-        secure = ("--credentials", config.bus.credentials) if config.bus.credentials else ()
-        specs.append(_spec(ROUTER, "--listen", own, *secure, *(["--insecure"] * insecure)))
+        credentials = config.bus.credentials
+        # That it may listen there has been decided before.
+        secure = ("--credentials", credentials) if credentials else ("--insecure",)
+        specs.append(_spec(ROUTER, "--listen", own, *secure))
     # What may differ from the stored configuration, such as the endpoint, goes along.
     changes = settings.differences(stored, config)
     options = [f"--set={key}={settings.toml_value(value)}" for key, _, value in changes]
