@@ -13,7 +13,7 @@ import pytest
 from gymnasium.error import InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
-from experiments.environment import MAX_EPISODE_STEPS, PICTURE_PX, CorridorEnv, env_id
+from experiments.environment import LIFE, MAX_EPISODE_STEPS, PICTURE_PX, CorridorEnv, env_id
 from services.robot_driver.driver import Driver
 from services.robot_driver.robot import Pose
 from services.robot_driver.simulated.sim import SimRobot
@@ -88,12 +88,12 @@ def test_the_driver_is_driven_as_ever(env: CorridorEnv) -> None:
     """The same observations, bumps and recoveries as actions executed one by one."""
     config = Config()
     robot = SimRobot(config.robot, load_world("plus"), config.run.seed)
-    driver = Driver(config, robot, "0" * 12)
+    driver = Driver(config, robot, LIFE)
     expected = driver.observe()
     _, info = env.reset()
     for action in np.random.default_rng(5).integers(3, size=120):
         assert info["observation"] == expected
-        driver.execute(int(action))
+        driver.execute(int(action), LIFE)
         expected = driver.observe()
         image, _, bumped, _, info = env.step(action)
         if bumped:

@@ -181,7 +181,7 @@ def test_claim_lets_endpoint_length_and_robot_differ(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("memory.capacity=7000", "memory.capacity is 6000 there, but 7000 now"),
+        ("memory.capacity=7000", "memory.capacity is 4000 there, but 7000 now"),
         ("run.seed=9", "run.seed is 1 there, but 9 now"),
         ("run.name=other", 'run.name is "demo" there, but "other" now'),
     ],

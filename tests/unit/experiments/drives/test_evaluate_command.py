@@ -15,9 +15,10 @@ from services.cli import main as cli
 from services.commander import frozen
 from services.learner import checkpoint
 from shared import run_record
-from shared.config import Config, NetworkConfig
+from shared.config import ActorNumerics, Config, NetworkConfig
 from shared.rl.learning import Trainer
 from shared.rl.network import initialised, to_bytes
+from shared.rl.predictor import Predictor
 from shared.settings import claim
 
 SMALL = {"network": {"filters": 4}, "memory": {"strategy": "normm"}}
@@ -93,7 +94,11 @@ def test_a_file_of_weights_alone_will_do(run: Path, tmp_path: Path) -> None:
     alone.write_bytes(WEIGHTS)
     found = frozen.read(frozen.find(alone))
     assert (found.episode, found.train_steps) == (None, None)
-    assert found.data == WEIGHTS
+    image = np.full((1, 50, 75), 99, np.uint8)
+    expected = Predictor(CONFIG.network, ActorNumerics())
+    expected.load(0, WEIGHTS)
+    values = found.predictor(CONFIG.network).all_values(image)
+    assert np.array_equal(values, expected.all_values(image))
     settings = ["--set", "network.filters=4", "--world", "minus"]
     assert corridor("evaluate", alone, *QUICK, *settings, "--out", tmp_path / "out") == 0
 
