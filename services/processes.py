@@ -7,6 +7,7 @@ read it. Recording and driving without learning are commands that join a run; th
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 COMMAND = (sys.executable, "-P", "-m", "services.cli")
@@ -48,9 +49,14 @@ class Process:
             return tuple(f"{self.name}-{extra}" for extra in self.extras)
         return (self.name,)
 
-    def ident(self, robot: str) -> str:
-        """The id under which the process that serves `robot` announces itself."""
-        return robot if self.per_robot else MAIN
+    def ident(self, robot: str, robots: Sequence[str] = ()) -> str:
+        """The id under which a process announces itself.
+
+        robot: that a driver drives; robots: that an actor serves, if it does not serve all.
+        """
+        if self.per_robot:
+            return robot
+        return robots[0] if self.name == "actor" and robots else MAIN
 
 
 ROUTER = Process(

@@ -51,6 +51,8 @@ class RunConfig(Section):
     """The only seed. Every random number is a function of it, a role and a position."""
     episodes: int = Field(default=0, ge=0)
     """Stop the run after this many counted episodes; 0 runs until stopped."""
+    robots: tuple[Name, ...] = Field(default=(), max_length=32, strict=False)
+    """Robots that an actor serves; empty: all that have no actor of their own."""
 
 
 class BusConfig(Section):
@@ -462,11 +464,11 @@ class Config(Section):
     def fingerprint(self) -> str:
         """16 hex digits over everything that must agree between services that work together.
 
-        Where the router is, how long the run goes on, which robot a driver drives and how it
-        reaches it may differ.
+        Where the router is, how long the run goes on, which robots an actor serves, which robot a
+        driver drives and how it reaches it may differ.
         """
         tree = self.to_dict()
-        del tree["bus"], tree["run"]["episodes"]
+        del tree["bus"], tree["run"]["episodes"], tree["run"]["robots"]
         for key in DRIVER_ONLY:
             del tree["robot"][key]
         text = json.dumps(tree, sort_keys=True, separators=(",", ":"))

@@ -77,6 +77,15 @@ class Service:
         with roles.claimed(self.bus, self.name, self.ident, self.life):
             self._meet_others()
 
+    def take_role(self, ident: str) -> None:
+        """Win another role of this service as well. Raises RoleTaken naming who has it."""
+        with roles.claimed(self.bus, self.name, ident, self.life):
+            self._announce(ident)
+
+    def _announce(self, ident: str) -> None:
+        fingerprint = self.config.fingerprint()
+        self.bus.announce(self.name, ident, self.life, PROTOCOL_VERSION, fingerprint)
+
     def _meet_others(self) -> None:
         fingerprint = self.config.fingerprint()
         for peer in self.bus.peers():
@@ -90,7 +99,7 @@ class Service:
                     f"{self.name}: has configuration {fingerprint}, but {peer.service} {peer.id!r} "
                     f"of run {self.config.run.name!r} has {peer.config}: start both from one file"
                 )
-        self.bus.announce(self.name, self.ident, self.life, PROTOCOL_VERSION, fingerprint)
+        self._announce(self.ident)
 
     def serve_control(self, inbox: Inbox) -> None:
         """Answer `ping` and `stop`, and watch over the role (runs in a thread of its own)."""

@@ -192,7 +192,8 @@ def _binds(key: str) -> bool:
     """Whether a setting is part of the fingerprint."""
     section, _, rest = key.partition(".")
     driver_only = section == "robot" and rest.partition(".")[0] in DRIVER_ONLY
-    return not (section == "bus" or key == "run.episodes" or driver_only)
+    own = key in ("run.episodes", "run.robots")
+    return not (section == "bus" or own or driver_only)
 
 
 class _Merged:

@@ -98,6 +98,10 @@ class Cluster:
             else:
                 self._launch(name, name, "--run-dir", str(self.folder))
 
+    def start_actor(self, robots: str) -> None:
+        """Start an actor that serves these robots alone."""
+        self._launch("actor", "actor", "--run-dir", str(self.folder), "--robots", robots)
+
     def start_second_driver(self, robot: str) -> None:
         """Start another simulated robot of the same run."""
         place = ("--run-dir", str(self.folder), "--set", f"robot.id={robot}")

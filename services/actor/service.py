@@ -13,7 +13,7 @@ import numpy as np
 from services.actor.courier import Courier
 from services.actor.session import Newest, Session
 from services.actor.targets import Targets
-from services.processes import DRIVER, LEARNER, MAIN
+from services.processes import ACTOR, DRIVER, LEARNER, MAIN
 from shared.config import Config, Numerics
 from shared.errors import CorridorError
 from shared.inbox import Inbox
@@ -25,7 +25,7 @@ from shared.messages import (
 )
 from shared.numerics import settle
 from shared.rl.predictor import Predictor
-from shared.service import TICK_S, Service, Stopped, service
+from shared.service import TICK_S, Service, Stopped, new_life, service
 from shared.weights import WeightsFetcher
 
 MAX_ROBOTS = 32
@@ -36,7 +36,10 @@ AGAIN_S = 1.0
 
 def run(config: Config, folder: Path, life: str) -> None:
     """Serve robots until stopped; a clean stop saves the open episodes."""
-    with service("actor", MAIN, config, life=life, halts=folder) as me:
+    ident = ACTOR.ident("", config.run.robots)
+    with service(ACTOR.name, ident, config, life=life, halts=folder) as me:
+        for robot in config.run.robots[1:]:
+            me.take_role(robot)
         loop = ActorLoop(me, folder / "actor", settle(config, folder, "actor"))
         with suppress(Stopped):
             loop.run()
@@ -51,10 +54,15 @@ class ActorLoop:
         self._targets = Targets(me.config.network, numerics)
         self._newest = Newest()
         self._sessions: dict[str, Session] = {}
+        self._known: set[str] = set()
+        """Robots that had a session of this process."""
         self._failed: dict[str, float] = {}
         """When the session of a robot ended with an error."""
         self._inbox: Inbox = me.bus.inbox()
-        self._inbox.subscribe(OBSERVATION)
+        for robot in me.config.run.robots or ("*",):
+            self._inbox.subscribe(OBSERVATION, robot)
+        if not me.config.run.robots:
+            self._inbox.watch(ACTOR.name)
         self._inbox.subscribe(LEARNER_STATE, MAIN)
         self._inbox.watch(LEARNER.name, MAIN)
         self._inbox.watch(DRIVER.name)
@@ -79,7 +87,10 @@ class ActorLoop:
             self._beat()
 
     def _has_room(self, robot: str) -> bool:
-        """Whether the robot is served, or can be now."""
+        """Whether the robot is served, or can be now. One with an actor of its own is not."""
+        if self._inbox.lives(ACTOR.name, robot) - {self._me.life}:
+            self._sessions.pop(robot, None)
+            return False
         failed_s = self._failed.get(robot, -AGAIN_S)
         rested = time.monotonic() - failed_s > AGAIN_S
         return robot in self._sessions or (rested and len(self._sessions) < MAX_ROBOTS)
@@ -118,11 +129,13 @@ class ActorLoop:
 
     def _session(self, robot: str) -> Session:
         if robot not in self._sessions:
-            path = self._folder / f"{robot}.msgpack"
+            life = new_life() if robot in self._known else self._me.life
+            self._known.add(robot)
             self._sessions[robot] = Session(
                 self._me,
                 robot,
-                path,
+                life,
+                self._folder / f"{robot}.msgpack",
                 self._newest,
                 self._weights,
                 self._targets,

@@ -26,7 +26,7 @@ from shared.messages import (
     RobotProgress,
 )
 from shared.rl.policy import Values
-from shared.service import Service, new_life
+from shared.service import Service
 from shared.weights import WeightsFetcher
 
 RIVAL_SILENT_S = 2.0
@@ -56,6 +56,7 @@ class Session:
         self,
         me: Service,
         robot: str,
+        life: str,
         path: Path,
         newest: Newest,
         weights: WeightsFetcher,
@@ -63,7 +64,11 @@ class Session:
         courier: Courier,
         lives: Callable[[], Collection[str]],
     ) -> None:
-        """Begin to serve a robot; `lives` tells which of its driver's lives have the role now."""
+        """Begin to serve a robot.
+
+        life: under which episodes are counted from 0, so no two sessions have the same.
+        lives: which of its driver's lives have the role now.
+        """
         self._me, self._robot, self._path = me, robot, path
         self._newest, self._weights, self._targets = newest, weights, targets
         self._courier, self._lives = courier, lives
@@ -71,7 +76,7 @@ class Session:
         self._asked: Future[RobotProgress] | None = None
         self._restored = False
         """The open episode is of an earlier process; `Actor.begin` has not judged it yet."""
-        self.actor = Actor(me.config, robot, new_life(), targets.none)
+        self.actor = Actor(me.config, robot, life, targets.none)
         self._pending: Episode | None = None
         """Finished, not yet acknowledged."""
         self._observation: Observation | None = None
@@ -166,7 +171,7 @@ class Session:
         self._counted = (now_s, self.actor.actions)
         progress, action = self.actor.progress, self._answered[1] if self._answered else None
         return ActorState(
-            id="main",
+            id=self._me.ident,
             life=self.actor.life,
             robot=self._robot,
             phase=self._phase(progress),

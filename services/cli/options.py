@@ -76,6 +76,14 @@ RobotOption = Annotated[
     str | None,
     typer.Option(help="Id of one robot; default: all robots of the run."),
 ]
+RobotsOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME,...",
+        help="Robots that it serves (run.robots); default: all that have no actor of their own.",
+        rich_help_panel=CHOOSE,
+    ),
+]
 AtEpisodeOption = Annotated[
     int,
     typer.Option(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +14,7 @@ from services.cli.options import (
     EndpointOption,
     InsecureOption,
     PresetOption,
+    RobotsOption,
     RunDirOption,
     RunOption,
     SeedOption,
@@ -23,7 +25,7 @@ from services.cli.options import (
     load,
 )
 from services.launcher.tether import tether
-from services.processes import ROUTER, SERVICES, Process
+from services.processes import ACTOR, ROUTER, SERVICES, Process
 from services.security.use import using
 
 if TYPE_CHECKING:
@@ -49,13 +51,19 @@ def _add_service(app: typer.Typer, process: Process) -> None:
         run_dir: RunDirOption = None,
         endpoint: EndpointOption = None,
         credentials: CredentialsOption = None,
+        robots: RobotsOption = None,
         tethered: TetheredOption = False,
     ) -> None:
         if tethered:
             tether()
-        loaded = load(preset, config, set_, run, seed, endpoint, credentials)
+        chosen = [*(set_ or []), *([f"run.robots={robots.split(',')}"] if robots else [])]
+        loaded = load(preset, config, chosen, run, seed, endpoint, credentials)
         raise typer.Exit(serve(process, loaded, run_dir or default_folder(loaded)))
 
+    if process is not ACTOR:
+        parameters = inspect.signature(command, eval_str=True).parameters
+        fitting = [parameters[name] for name in parameters if name != "robots"]
+        command.__signature__ = inspect.Signature(fitting)  # type: ignore[attr-defined]
     app.command(process.name, help=process.purpose)(command)
 
 
@@ -72,7 +80,9 @@ def serve(process: Process, config: Config, folder: Path) -> int:
         with starting():
             import_installed(process.module, process.extras[0]).run(own, folder, life)
 
-    with roles.locked(folder, process.name, process.ident(config.robot.id), life):
+    with roles.locked(
+        folder, process.name, process.ident(config.robot.id, config.run.robots), life
+    ):
         run_record.begin(folder, claim(folder, config))
         setup_logging(process.name, folder)
         return guarded(process.name, run)

@@ -54,7 +54,7 @@ def check(name: str, config: Config) -> str:
 
 def _doing(bus: Bus, name: str, config: Config) -> str:
     """Ping the service and wait for its heartbeat. Raises BusError when it does not answer."""
-    ident = BY_NAME[name].ident(config.robot.id)
+    ident = BY_NAME[name].ident(config.robot.id, config.run.robots)
     inbox = bus.inbox()
     reader = Reader(inbox, robot=ident if name == DRIVER.name else "*")
     bus.request(PING, Ping(), ServiceReply, ident=f"{name}-{ident}")

@@ -16,7 +16,8 @@ from shared import roles
 from shared.bus import Bus
 from shared.config import BusConfig
 from shared.errors import RoleTaken
-from shared.messages import PROTOCOL_VERSION
+from shared.keys import ACTION
+from shared.messages import PROTOCOL_VERSION, Action
 from shared.service import new_life
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
@@ -111,3 +112,40 @@ def test_a_role_of_which_the_holder_is_frozen_ends_with_its_lease(
         after = cluster.replay()
         assert after is not None
         cluster.wait_episodes(after.episode + 2, 90)
+
+
+def test_an_actor_may_have_robots_of_its_own(cluster: Cluster, tmp_path: Path) -> None:
+    """Two sites with an actor each share one memory; nobody serves the other's robots."""
+    cluster.start_second_driver("second")
+    inbox = cluster.bus.inbox()
+    inbox.subscribe(ACTION)
+
+    def served_by(robot: str, life: str) -> bool:
+        inbox.wait(0.2)
+        taken = [a.actor_life for name, a in inbox.take(ACTION, Action) if name == robot]
+        return taken[-1:] == [life]
+
+    def lives(ident: str) -> list[str]:
+        return [peer.life for peer in cluster.bus.peers("actor", ident)]
+
+    (main,) = lives("main")
+    cluster.wait(lambda: served_by("second", main), 60, "one actor for both")
+    with Cluster(cluster.config, tmp_path / "site") as site:
+        site.start_actor("second,third")
+        cluster.wait(lambda: bool(lives("second") and lives("third")), 60, "an actor of its own")
+        (own,) = lives("second")
+        cluster.wait(lambda: served_by("second", own), 60, "it serves its robot")
+        cluster.wait(lambda: served_by("robotino1", main), 60, "and the other one the rest")
+        with Cluster(cluster.config, tmp_path / "twin") as twin:
+            twin.start_actor("third")
+            assert twin.ended("actor") == 4
+            assert f"life {own}" in twin.log("actor")
+        assert not served_by("second", main)
+        before = cluster.learner()
+        assert before is not None
+        cluster.wait_episodes(before.episode + 3, 90)
+        site.stop("actor")
+    cluster.wait(lambda: not served_by("second", own), 60, "nobody serves it")
+    heard = cluster.bus.inbox()
+    heard.subscribe(ACTION, "second")
+    cluster.wait(lambda: heard.wait(1.0), 60, "it is served again")

@@ -29,10 +29,11 @@ from services.security.authority import Authority
 from services.security.kinds import Credential
 from services.security.rules import TOKENS
 from services.security.use import using
-from shared.bus import Bus, open_router, zenoh_config
+from shared.bus import Bus, open_router
 from shared.config import BusConfig
 from shared.errors import RouterMissing
 from shared.keys import OBSERVATION, ROBOT_WORLD, Stream
+from shared.zenoh_settings import zenoh_config
 
 pytestmark = pytest.mark.system
 

@@ -16,7 +16,7 @@ from shared.service import Service, StopFlag
 from shared.settings import keys
 
 LIFE = "0" * 12
-MAY_DIFFER = ("bus.", "run.episodes", *(f"robot.{key}" for key in DRIVER_ONLY))
+MAY_DIFFER = ("bus.", "run.episodes", "run.robots", *(f"robot.{key}" for key in DRIVER_ONLY))
 FINGERPRINT = Config().fingerprint()
 
 
@@ -71,6 +71,8 @@ def changed(section: Section, path: list[str]) -> Any:
     choices = get_args(type(section).model_fields[name].annotation)
     if rest:
         other = changed(value, rest)
+    elif isinstance(value, tuple):
+        other = (*value, "x")
     elif choices:
         other = next(choice for choice in choices if choice != value)
     else:

@@ -62,7 +62,17 @@ class Rig:
         courier = SimpleNamespace(send=lambda _: self.on_its_way, ask=lambda _: asked)
         newest = Newest(LEARNER)
         path = folder / "robot1.msgpack"
-        given: tuple[Any, ...] = (me, "robot1", path, newest, weights, targets, courier, set)
+        given: tuple[Any, ...] = (
+            me,
+            "robot1",
+            "c" * 12,
+            path,
+            newest,
+            weights,
+            targets,
+            courier,
+            set,
+        )
         self.session = Session(*given)
 
     def see(self, sequence: int, **given: Any) -> None:
