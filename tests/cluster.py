@@ -139,10 +139,6 @@ class Cluster:
                 f"{name} ended with {process.returncode}: {self.log(name)}"
             )
 
-    def ended(self, name: str) -> int:
-        """Exit code of a process that ends by itself."""
-        return self._processes[name].wait(20)
-
     def stop_all(self) -> None:
         """Stop everything the way `corridor up` does."""
         self.stop("driver", "actor", "replay", "learner", "router")
