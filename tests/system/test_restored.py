@@ -35,6 +35,7 @@ def test_a_restored_memory_ends_the_learner_until_somebody_decides(
         assert refused is not None
 
         shutil.rmtree(checkpoint.parent)
+        shutil.rmtree(folder / "actor")  # an open episode of weights that are no more
         cluster.start("learner", "actor", "driver")
 
         def goes_on() -> bool:
