@@ -23,7 +23,7 @@ from shared import settings
 from shared.bus import Bus
 from shared.config import Config
 from shared.errors import PeerMissing, RouterMissing
-from shared.halting import RobotOrder, order
+from shared.halts.orders import RobotOrder, order
 from shared.keys import ROBOT_STATE
 from shared.messages import RobotState
 from shared.provenance import ROOT

@@ -21,6 +21,7 @@ from shared import roles
 from shared.bus import Bus
 from shared.config import Config
 from shared.errors import (
+    BadMessage,
     BusError,
     ConfigError,
     CorridorError,
@@ -30,7 +31,7 @@ from shared.errors import (
     RouterMissing,
     StateError,
 )
-from shared.halt_keeper import HaltKeeper
+from shared.halts.keeper import HaltKeeper
 from shared.inbox import Inbox
 from shared.keys import PING, STOP
 from shared.messages import PROTOCOL_VERSION, ServiceReply, StopService
@@ -62,6 +63,8 @@ class Service:
     ) -> None:
         self.name, self.ident, self.life = name, ident, life
         self.config, self.bus, self.stop = config, bus, stop
+        self.control: Inbox = bus.inbox()
+        """Questions about this process; its thread serves them."""
         self.started_s = time.monotonic()
         self.log = logging.getLogger(name)
         self.rivals = 0
@@ -80,7 +83,13 @@ class Service:
     def take_role(self, ident: str) -> None:
         """Win another role of this service as well. Raises RoleTaken naming who has it."""
         with roles.claimed(self.bus, self.name, ident, self.life):
+            self.serve_role(ident)
             self._announce(ident)
+
+    def serve_role(self, ident: str) -> None:
+        """Answer questions about a role."""
+        for stream in (PING, STOP):
+            self.control.serve(stream, f"{self.name}-{ident}")
 
     def _announce(self, ident: str) -> None:
         fingerprint = self.config.fingerprint()
@@ -101,8 +110,9 @@ class Service:
                 )
         self._announce(self.ident)
 
-    def serve_control(self, inbox: Inbox) -> None:
+    def serve_control(self) -> None:
         """Answer `ping` and `stop`, and watch over the role (runs in a thread of its own)."""
+        inbox = self.control
         known, looked_s, woke_s = frozenset({self.life}), time.monotonic(), -math.inf
         while not self.stop.is_set():
             inbox.wait(TICK_S)
@@ -139,10 +149,13 @@ class Service:
             rivals=self.rivals,
         )
 
-    def insist(self, what: str, attempt: Callable[[], T]) -> T:
+    def insist(self, what: str, attempt: Callable[[], T], *, refusable: bool = False) -> T:
         """Repeat a request until it is answered; log when it takes long.
 
-        Raises Stopped, and PeerRefused when it was refused for good.
+        refusable: it may be refused for good, and is then not repeated. Other requests are always
+        right, so a refusal of one is a mistake or a lie, and somebody will answer it.
+
+        Raises Stopped, and PeerRefused if it is `refusable`.
         """
         start_s, next_report_s = time.monotonic(), 5.0
         while True:
@@ -150,8 +163,8 @@ class Service:
                 raise Stopped(what)
             try:
                 return attempt()
-            except BusError as error:
-                if isinstance(error, PeerRefused) and error.final:
+            except (BusError, BadMessage) as error:
+                if refusable and isinstance(error, PeerRefused) and error.final:
                     raise
                 waited_s = time.monotonic() - start_s
                 if waited_s > next_report_s:
@@ -249,11 +262,9 @@ def service(
 @contextmanager
 def controlled(me: Service) -> Iterator[None]:
     """Answer `ping` and `stop` while the block runs; the stop flag is set at its end."""
-    control = me.bus.inbox()
-    for stream in (PING, STOP):
-        control.serve(stream, f"{me.name}-{me.ident}")
-    control.watch(me.name, me.ident)
-    thread = threading.Thread(target=me.serve_control, args=(control,), daemon=True)
+    me.serve_role(me.ident)
+    me.control.watch(me.name, me.ident)
+    thread = threading.Thread(target=me.serve_control, daemon=True)
     thread.start()
     try:
         yield

@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from shared.bus import Bus
 from shared.config import BusConfig, Config
-from shared.halts import HaltBook, means
+from shared.halts.book import HaltBook, means
 from shared.keys import HALT, PING, RELEASE, STOP, Stream
 from shared.messages import PROTOCOL_VERSION, Halts, Message, Release, ServiceReply, Standing
 from shared.service import new_life

@@ -51,7 +51,7 @@ class Courier:
                 PROGRESS, ProgressRequest(robot=robot), RobotProgress, ident=robot
             )
 
-        return self._me.insist("ask replay for the robot's progress", attempt)
+        return self._me.insist("ask replay for the robot's progress", attempt, refusable=True)
 
     def _deliver(self, episode: Episode) -> Delivery:
         attempts = 0
@@ -61,4 +61,6 @@ class Courier:
             attempts += 1
             return self._me.bus.request(EPISODE, episode, EpisodeAck, ident=episode.robot)
 
-        return Delivery(self._me.insist("hand an episode to replay", attempt), attempts)
+        return Delivery(
+            self._me.insist("hand an episode to replay", attempt, refusable=True), attempts
+        )

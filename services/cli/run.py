@@ -24,7 +24,7 @@ from services.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from shared.halting import RobotOrder
+    from shared.halts.orders import RobotOrder
 
 GivenRouterOption = Annotated[
     str | None,

@@ -19,7 +19,7 @@ from services.commander.commander import Commander, commanding
 from services.commander.keyboard import KeyParser, Wish
 from shared.config import Config
 from shared.errors import ConfigError, PeerMissing
-from shared.halting import halt
+from shared.halts.orders import halt
 from shared.messages import Motion, Observation
 
 POLL_S = 0.02

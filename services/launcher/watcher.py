@@ -13,8 +13,8 @@ from services.security.use import using
 from shared.bus import Bus
 from shared.config import Config
 from shared.errors import RouterMissing
-from shared.halting import halt
-from shared.halts import ALL
+from shared.halts.book import ALL
+from shared.halts.orders import halt
 
 log = logging.getLogger(__name__)
 LOOK_S = 0.25

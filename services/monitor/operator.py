@@ -18,8 +18,8 @@ from shared.codec import first_problem
 from shared.config import Config
 from shared.errors import BadMessage, BusError, ConfigError, PeerMissing
 from shared.facts import NAME
-from shared.halting import RobotOrder, order
-from shared.halts import ALL
+from shared.halts.book import ALL
+from shared.halts.orders import RobotOrder, order
 from shared.keys import ROBOT_WORLD, STOP, Peer, Stream
 from shared.messages import (
     Message,

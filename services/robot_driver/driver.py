@@ -52,9 +52,8 @@ class Driver:
         self._bump = False
         self._interruption: Interruption = ""
         self._begun: tuple[int | None, str] = (None, "")
-        """The action in force, and the life of the actor that sent it."""
-        self._executed: tuple[int | None, str] = (None, "")
-        """The action that was executed last."""
+        """The action in force and the life of its actor; below, those executed last."""
+        self._executed: tuple[int | None, str] = self._begun
         self._pose = Pose(0.0, 0.0, 0.0)
 
     @property
@@ -195,16 +194,13 @@ class Driver:
         self._control.halt()
 
     def hold(self, kinds: Collection[HaltKind]) -> bool:
-        """Stand while halts of these kinds are in force; without any, go on and look anew.
-
-        Returns whether the robot has been told to stand and no action will move it.
-        """
-        safety, before = self.safety, (self.safety.estop, self.safety.paused)
-        safety.estop, safety.paused = "estop" in kinds, "pause" in kinds
-        if before[0] and not safety.estop:
+        """Stand while halts of these kinds are in force, else look anew; whether it stands."""
+        safety, realtime = self.safety, self._config.robot.timing == "realtime"
+        if safety.estop and "estop" not in kinds:
             self.look_again("estop")
-        if before[1] and not safety.paused and self._config.robot.timing == "realtime":
+        if safety.paused and "pause" not in kinds and realtime:
             self.look_again("pause")
+        safety.estop, safety.paused = "estop" in kinds, "pause" in kinds
         if safety.halted:
             self.halt()
         return safety.halted
@@ -290,9 +286,7 @@ class Driver:
         }
 
     def restore(self, saved: dict[str, Any]) -> None:
-        """Continue, in a life of one's own, from `saved()`.
-
-        Raises KeyError, TypeError or ValueError when it does not fit.
+        """Continue from `saved()`. Raises KeyError, TypeError or ValueError when it does not fit.
 
         A real robot was not held still meanwhile: what it perceives next tells of a restart.
         """
@@ -316,14 +310,11 @@ class Driver:
 
     def _rearrange(self, wish: WorldChange) -> WorldChanged:
         """Tell what waits, or withdraw some of it."""
-        if wish.kind == "withdraw":
-            try:
-                self._changes.withdraw(wish.id)
-            except ValueError as error:
-                self._refused(wish, str(error))
-                return self._changes.answer(wish, str(error))
-            self._host.keep(self._changes.kept())
-        return self._changes.answer(wish, "")
+        refusal = self._changes.withdraw(wish.id) if wish.kind == "withdraw" else ""
+        if refusal:
+            self._refused(wish, refusal)
+        self._host.keep(self._changes.kept())
+        return self._changes.answer(wish, refusal)
 
     def _carry_out(self, episode: int) -> list[Outcome]:
         """Carry out what is due; the robot then stands still and looks again."""

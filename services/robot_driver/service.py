@@ -15,7 +15,7 @@ from services.robot_driver.robot import NotReady
 from shared import statefile
 from shared.config import Config
 from shared.errors import StateError
-from shared.halt_keeper import KeptBook, clock_s
+from shared.halts.keeper import KeptBook, clock_s
 from shared.inbox import Inbox
 from shared.keys import ACTION, HALT, OBSERVATION, RELEASE, ROBOT_STATE, ROBOT_WORLD
 from shared.messages import Action, Halts, Observation, Release, Standing, WorldChange

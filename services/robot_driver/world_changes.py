@@ -83,12 +83,11 @@ class WorldChanges:
         self._check(change, self._robot)
         insort(self._pending, change, key=_episode)
 
-    def withdraw(self, ident: str) -> None:
-        """Forget a change that waits. Raises ValueError if there is none with this id."""
-        left = [change for change in self._pending if change.id != ident]
-        if len(left) == len(self._pending):
-            raise ValueError(f"no change with id {ident} waits")
-        self._pending = left
+    def withdraw(self, ident: str) -> str:
+        """Forget a change that waits; return why not, if there is none with this id."""
+        count = len(self._pending)
+        self._pending = [change for change in self._pending if change.id != ident]
+        return "" if len(self._pending) < count else f"no change with id {ident} waits"
 
     def carry_out(self, episode: int) -> list[Outcome]:
         """Carry out, in order, what is due in this episode of the robot."""

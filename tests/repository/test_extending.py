@@ -187,7 +187,7 @@ with Cluster(config, Path(sys.argv[1])) as cluster:
     cluster.start("router", "replay")
     cluster.wait(lambda: cluster.replay() is not None, 60, "replay is there")
     assert cluster.bus.request(WORLDS, WorldsRequest(), Worlds).names == ()
-    ack = cluster.bus.request(EPISODE, make_episode(20), EpisodeAck)
+    ack = cluster.bus.request(EPISODE, make_episode(20), EpisodeAck, ident="robot1")
     assert ack.accepted, ack
     assert cluster.bus.request(WORLDS, WorldsRequest(), Worlds).names == ("plus",)
 """,

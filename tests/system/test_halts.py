@@ -10,7 +10,7 @@ import pytest
 from cluster import ALL, Cluster, make_config
 
 from shared.errors import PeerMissing
-from shared.halting import order
+from shared.halts.orders import order
 from shared.inbox import Inbox
 from shared.keys import HALT, OBSERVATION, RELEASE
 from shared.messages import Deadline, Halts, Observation, Release, Standing

@@ -10,7 +10,7 @@ from cluster import ALL, Cluster, make_config
 
 from benchmarks.waiting import wait_until
 from services.replay.storage import Storage
-from shared.halting import RobotOrder, order
+from shared.halts.orders import RobotOrder, order
 from shared.keys import ACTOR_STATE, OBSERVATION, ROBOT_STATE
 from shared.messages import ActorState, Observation, RobotState
 

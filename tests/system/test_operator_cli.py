@@ -154,7 +154,7 @@ def test_a_command_that_nobody_hears_fails_in_one_line(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("shared.halting.NOBODY_S", 0.5)
+    monkeypatch.setattr("shared.halts.orders.NOBODY_S", 0.5)
     for command in ("estop", "clear"):
         for robot in ([], ["--robot", "r9"]):
             assert cli.main([command, *options, *robot]) == 1

@@ -36,7 +36,7 @@ def test_every_robot_is_told_and_who_stands_is_shown(config: Config) -> None:
 def test_without_a_robot_or_a_router_it_says_so(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shared.halting.NOBODY_S", 0.3)
+    monkeypatch.setattr("shared.halts.orders.NOBODY_S", 0.3)
     watcher = Watcher(config)
     watcher.halt()  # it has not begun
     assert watcher.told.endswith(" emergency stop: NOT sent: no router answers")

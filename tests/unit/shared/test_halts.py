@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared.halts import ALL, RELEASE_WITHIN_S, HaltBook, means, new_halt
+from shared.halts.book import ALL, RELEASE_WITHIN_S, HaltBook, means, new_halt
 from shared.messages import MAX_HALTS, MAX_RELEASED, Deadline, Halt, Release, Released
 
 ROBOTS = ("a", "b")

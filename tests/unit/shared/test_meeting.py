@@ -25,6 +25,7 @@ def meet(peer: Peer) -> list[tuple[Any, ...]]:
     announced: list[tuple[Any, ...]] = []
     bus: Any = SimpleNamespace(
         run="demo",
+        inbox=lambda: SimpleNamespace(serve=lambda *_: None),
         config=BusConfig(),
         peers=lambda *role: [] if role else [peer],
         claims=lambda *_: set(),

@@ -60,7 +60,7 @@ def of(robot: str) -> Any:
 
 
 def courier(replay: Replay, notify: Callable[[], None]) -> Courier:
-    def insist(_: str, attempt: Callable[[], Any]) -> Any:
+    def insist(_: str, attempt: Callable[[], Any], **__: Any) -> Any:
         while True:
             try:
                 return attempt()
@@ -86,7 +86,7 @@ def test_attempts_are_counted_and_failures_arrive() -> None:
     sender = courier(Replay(silences=2), lambda: None)
     assert sender.send(of("any")).result(PATIENCE_S).attempts == 3
 
-    def stopped(_: str, attempt: Callable[[], Any]) -> Any:
+    def stopped(_: str, attempt: Callable[[], Any], **__: Any) -> Any:
         raise RuntimeError("stopped")
 
     sender = Courier(SimpleNamespace(bus=None, insist=stopped), lambda: None)  # type: ignore[arg-type]

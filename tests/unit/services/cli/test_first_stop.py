@@ -12,7 +12,7 @@ import pytest
 from services.cli import first_stop
 from services.cli.first_stop import Target, find, message
 from shared.codec import decode
-from shared.halts import new_halt
+from shared.halts.book import new_halt
 from shared.messages import Halts
 
 PLAIN = {"CORRIDOR_BUS__ENDPOINT": "tcp/h:1"}

@@ -22,7 +22,14 @@ SLOW_DISK = settings(deadline=None, max_examples=60, derandomize=True)
 EVENTS = (
     *["go"] * 12,
     *("bump", "late", "contact before the answer", "moved", "blocked with a bump"),
-    *("answer lost", "driver killed", "actor killed", "actor stopped", "acknowledgement lost"),
+    *(
+        "answer lost",
+        "driver killed",
+        "driver stopped",
+        "actor killed",
+        "actor stopped",
+        "acknowledgement lost",
+    ),
     *("new weights", "replay killed"),
 )
 
@@ -56,6 +63,8 @@ class Robot:
         self.name, self.config, self.replay = name, config, replay
         self.predictor, self.lives = FakePredictor(), 0
         self.life, self.sequence, self.attempt = self.new_life(), 0, 0
+        self.earlier: tuple[str, ...] = ()
+        self.executed: tuple[int | None, str] = (None, "")
         self.seen: dict[str, Any] = {}
         self.twice = False
         self.actor = self.new_actor()
@@ -73,7 +82,9 @@ class Robot:
         return made  # type: ignore[no-any-return]
 
     def observation(self) -> Observation:
-        plain = {"robot": self.name, "life": self.life, "attempt": self.attempt}
+        action, actor_life = self.executed
+        plain: dict[str, Any] = {"robot": self.name, "life": self.life, "attempt": self.attempt}
+        plain |= {"earlier": self.earlier, "action": action, "actor_life": actor_life}
         return make_observation(self.sequence, **plain, **self.seen)
 
     def look(self) -> None:
@@ -83,7 +94,8 @@ class Robot:
         if episode is not None:
             self.replay.commit(episode, twice=self.twice)
             self.actor.committed(self.replay.progress(self.name))
-        self.actor.act(observation)
+        action = self.actor.act(observation)
+        self.answer = (action.action, action.actor_life)
 
     def happen(self, event: str) -> None:
         self.seen, self.twice = {}, event == "acknowledgement lost"
@@ -95,6 +107,9 @@ class Robot:
             self.actor = self.new_actor(msgpack.unpackb(msgpack.packb(self.actor.state())))
         elif event == "driver killed":
             self.life, self.sequence, self.attempt = self.new_life(), 0, 0
+            self.earlier, self.executed = (), (None, "")
+        elif event == "driver stopped":
+            self.earlier, self.life = (self.life, *self.earlier)[:8], self.new_life()
         elif event in ("late", "moved", "contact before the answer"):
             self.attempt += 1
             bump = event.startswith("contact")
@@ -102,7 +117,7 @@ class Robot:
         elif event == "answer lost":
             self.attempt += 1
         else:
-            self.sequence, self.attempt = self.sequence + 1, 0
+            self.sequence, self.attempt, self.executed = self.sequence + 1, 0, self.answer
             bump = event in ("bump", "blocked with a bump")
             self.seen = {"bump": bump}
             if event.startswith("blocked"):
@@ -138,5 +153,6 @@ def test_what_a_correct_actor_sends_is_stored_once_and_never_refused(
         replay.storage.close()
     stored = [(e.robot, e.robot_life, s) for e in replay.taken for s in sequences(e)]
     assert len(stored) == len(set(stored))
+    assert sum(robot.actor.foreign_actions for robot in robots) == 0
     for episode in replay.taken:
         assert max(sequences(episode)) <= episode.last_sequence

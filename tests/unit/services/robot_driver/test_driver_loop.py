@@ -26,8 +26,8 @@ from services.robot_driver.safety import Safety
 from services.robot_driver.service import DriverLoop, ServiceHost
 from shared import statefile
 from shared.config import Config
-from shared.halt_keeper import clock_s
-from shared.halts import new_halt
+from shared.halts.book import new_halt
+from shared.halts.keeper import clock_s
 from shared.keys import OBSERVATION, Stream
 from shared.messages import (
     Action,

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from shared import statefile
 from shared.errors import StateError
-from shared.halts import HaltBook, means
+from shared.halts.book import HaltBook, means
 from shared.keys import HALT, RELEASE
 from shared.messages import DriverState, Halts, Release, Standing
 

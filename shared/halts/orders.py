@@ -1,7 +1,7 @@
 """Halts robots and releases them, and tells who stands: for the command line and other tools.
 
 A halt is sent again until every driver that is there, or was there meanwhile, has shown that its
-robot stands. Services keep it for drivers that restart (`shared.halt_keeper`).
+robot stands. Services keep it for drivers that restart (`shared.halts.keeper`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Literal
 
 from shared.bus import Bus
 from shared.errors import PeerMissing
-from shared.halts import ALL, RELEASE_WITHIN_S, new_halt
+from shared.halts.book import ALL, RELEASE_WITHIN_S, new_halt
 from shared.keys import HALT, RELEASE, Role
 from shared.messages import (
     MAX_HALTS,
