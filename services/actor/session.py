@@ -147,7 +147,8 @@ class Session:
                 self.actor.begin(self.actor.progress, self._observation)
                 self._restored = False
             self._finish(self._observation)  # it may have come meanwhile
-        if self._may_act():
+        self._finish(self._observation)
+        if self._finished is self._observation and self._pending is None and self._may_act():
             return self._observation
         self._hold(self._observation)
         return None
@@ -233,12 +234,15 @@ class Session:
     def _finish(self, observation: Observation) -> None:
         """End the open episode if this observation ends it. It needs the weights of the episode.
 
-        Once for each observation, and not before the episode that ended last is handed over.
+        Once for each observation, and not before the episode that ended last is handed over and
+        there are weights: `advance` tries again.
         """
         if self._pending is not None or self._finished is observation:
             return
         if len(self.actor.open) and self.actor.predictor.version == 0:
-            self._load(*self._weights.wait_for(1))
+            self._load(*self._weights.newest)
+            if self.actor.predictor.version == 0:
+                return
         self._pending, self._finished = self.actor.finish(observation), observation
 
     def _handed_over(self, episode: Episode) -> bool:
