@@ -74,7 +74,8 @@ def serve(process: Process, config: Config, folder: Path) -> int:
     from shared.settings import claim
 
     life = new_life()
-    own = using(config, process.name, f"{process.name}-{config.robot.id}")
+    names = [".".join(config.run.robots), "", config.robot.id]
+    own = using(config, *("-".join(filter(None, (process.name, name))) for name in names))
 
     def run() -> None:
         with starting():
