@@ -382,8 +382,10 @@ def play(seed: int, events: int, run_name: str, place: Path) -> dict[str, float]
     config = make_config(run_name, bus={"endpoint": free_endpoint()})
     with Chaos(config, place) as chaos:
         try:
-            for event in draw(seed, events):
+            for number, event in enumerate(draw(seed, events), start=1):
                 chaos.happen(event)
+                if not number % 100:
+                    print(f"{number} events, {chaos.checker.actions} actions", flush=True)
             chaos.recover()
             stored = chaos.judge_memory()
         except AssertionError as error:
