@@ -20,93 +20,46 @@ import tempfile
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.chaos_events import (
+    MOVABLE,
+    PROCESSES,
+    RELEASES,
+    ROBOTS,
+    ROLES,
+    SECOND,
+    Event,
+    draw,
+)
 from benchmarks.cluster import Cluster, make_config
 from benchmarks.frame import Bar, report, table
 from benchmarks.invariants import Checker
 from services.launcher.up import free_endpoint
-from services.recorder.tap import Tap
+from services.recorder.tap import Heard, Tap
 from services.replay.storage import Storage
 from shared.codec import decode
 from shared.config import Config
-from shared.errors import PeerMissing
+from shared.errors import BadMessage, PeerMissing
 from shared.halting import RobotOrder, order
-from shared.keys import ACTION, ACTOR_STATE, LEARNER_STATE, OBSERVATION, REPLAY_STATE, ROBOT_STATE
+from shared.keys import (
+    ACTION,
+    ACTOR_STATE,
+    LEARNER_STATE,
+    OBSERVATION,
+    REPLAY_STATE,
+    ROBOT_STATE,
+    check_sender,
+)
 from shared.messages import HaltKind, LearnerState
 
 LONG = True
 STREAMS = (OBSERVATION, ACTION, ROBOT_STATE, ACTOR_STATE, REPLAY_STATE, LEARNER_STATE)
-SECOND = "second"
-ROBOTS = ("robotino1", SECOND)
-ROLES = {
-    "replay": ("replay", "main"),
-    "learner": ("learner", "main"),
-    "actor": ("actor", "main"),
-    "driver": ("driver", ROBOTS[0]),
-    f"driver-{SECOND}": ("driver", SECOND),
-}
-"""Processes of the run, with what they announce themselves as."""
-PROCESSES = ("router", *ROLES)
-MOVABLE = ("actor", "driver", f"driver-{SECOND}")
-"""What may take over a role from another folder; the memory and the networks are only in one."""
-KINDS = {
-    "kill": 30, "freeze": 20, "duplicate": 12, "stop": 12, "router": 6, "estop": 8, "pause": 5,
-    "kill all": 2,
-}  # fmt: skip
-RELEASES: dict[str, RobotOrder] = {"estop": "clear", "pause": "resume"}
 PATIENCE_S, LEARNS_S, DOUBLE_S = 120.0, 240.0, 15.0
-Draws = random.Random
 
 
 class Violation(AssertionError):
     """Something that must hold did not."""
-
-
-@dataclass(frozen=True)
-class Event:
-    """One thing that happens, with everything that was drawn for it."""
-
-    kind: str
-    target: str
-    """A process; of orders a robot, or empty for all."""
-    lasts_s: float
-    """How long something is frozen, or the router away."""
-    restart_s: float
-    """How soon what ended is started again."""
-    pause_s: float
-    """Until the next event."""
-    elsewhere: bool = False
-    """A duplicate runs in another folder."""
-
-
-def draw(seed: int, count: int) -> list[Event]:
-    """The events of a seed. A halt lasts for one to four others, in which drivers suffer most."""
-    draws = Draws(seed)
-    plan: list[Event] = []
-    in_force: dict[str, tuple[int, str]] = {}
-    while len(plan) < count:
-        due = [kind for kind, (until, _) in in_force.items() if len(plan) >= until]
-        kinds = {kind: weight for kind, weight in KINDS.items() if kind not in in_force}
-        if in_force:
-            kinds["kill all"] = 6
-        kind = RELEASES[due[0]] if due else draws.choices(list(kinds), list(kinds.values()))[0]
-        targets = [*PROCESSES, *(MOVABLE if in_force else ())]
-        target = draws.choice(targets[1:] if kind == "duplicate" else targets)
-        if due:
-            target = in_force.pop(due[0])[1]
-        elif kind in RELEASES:
-            target = draws.choice(("", "", *ROBOTS))
-            in_force[kind] = (len(plan) + draws.randint(2, 5), target)
-        lasts_s = draws.uniform(0.1, 6.0) if kind == "freeze" else draws.uniform(0.0, 5.0)
-        plan.append(
-            Event(
-                *(kind, target, lasts_s, draws.uniform(0.0, 1.0), draws.uniform(0.0, 1.0)),
-                elsewhere=draws.random() < 0.5,
-            )
-        )
-    return plan
 
 
 class Chaos:
@@ -155,16 +108,25 @@ class Chaos:
                 self._timers.remove(entry)
                 entry[1]()
             for heard in self._tap.take(min(0.02, max(duration_s, 0.0))):
-                message = decode(heard.data, heard.stream.request)
-                if isinstance(message, LearnerState):
-                    self.newest = message
-                self.checker.hear(message)
+                self._hear(heard)
             self._supervise()
             self._look_for_doubles()
             if self.checker.violations:
                 raise Violation("; ".join(self.checker.violations))
             if time.monotonic() >= until_s:
                 return
+
+    def _hear(self, heard: Heard) -> None:
+        """Judge a message; one that came under the key of another is refused, as services do it."""
+        try:
+            message = decode(heard.data, heard.stream.request)
+            check_sender(heard.stream, heard.ident, message)
+        except BadMessage as error:
+            self.counts["misdelivered"] += 1
+            self.happened.append(f"{heard.stream.name} of {heard.ident}: {error}")
+            return
+        self.newest = message if isinstance(message, LearnerState) else self.newest
+        self.checker.hear(message)
 
     def wait(self, condition: Callable[[], object], what: str, limit_s: float = PATIENCE_S) -> None:
         """Let time pass until a condition holds. Raises Violation at the deadline."""
@@ -280,11 +242,16 @@ class Chaos:
             if sure:
                 raise Violation(f"a second {name} works beside the first: {twins.log(label)}")
             self.counts["taken over"] += 1
+            self.wait(lambda: decided() and self._alone(name), f"one {name} is left")
             self.pump(1.0)
             twins.signal(label, signal.SIGTERM)
         self.wait(lambda: decided() and twins.code(label) is not None, f"a second {name} ends")
         if twins.code(label) not in ((4,) if sure else (0, 4)):
             raise Violation(f"a second {name} ended with {twins.code(label)}: {twins.log(label)}")
+
+    def _alone(self, name: str) -> bool:
+        """Whether no two processes have one role, and none that may think so is frozen."""
+        return name not in self._frozen and len(self._present.lives(*ROLES[name])) < 2
 
     def _has_role(self, name: str) -> bool:
         """Whether the process runs, and the bus shows that it has its role."""

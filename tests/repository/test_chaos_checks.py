@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from builders import make_config, make_episode, make_observation
 
-from benchmarks.chaos import RELEASES, draw
+from benchmarks.chaos_events import RELEASES, draw
 from benchmarks.invariants import Checker, numbering_faults, sequence_faults
 from services.replay.storage import Storage
 from shared.messages import Action, ReplayState, RobotState
