@@ -26,6 +26,9 @@ from shared.messages import (
     RobotState,
 )
 
+UNDER_WAY = 2
+"""Actions of which a driver may tell after its first message under a halt: they were executed
+before it heard of it, and what tells of them was under way."""
 Record = Mapping[str, Any]
 """One submission, as `Storage.records` gives it."""
 
@@ -59,16 +62,15 @@ class Checker:
         """These robots were confirmed to stand: from now on none may move."""
         for robot in robots:
             self._halts[robot].add(kind)
-            for life, state in self._shown.items():
-                if state.robot == robot and state.state in ("estop", "paused"):
-                    self._limits.setdefault(life, self._sequences[life])
+            for life in filter(self.shows_halt, self._lives_of(robot)):
+                self._limits.setdefault(life, self._sequences[life])
 
     def released(self, kind: HaltKind, robots: Iterable[str]) -> None:
         """A release is about to be sent."""
         for robot in robots:
             self._halts[robot].discard(kind)
             if not self._halts[robot]:
-                for life in [life for life, its in self._lives.items() if its == robot]:
+                for life in self._lives_of(robot):
                     self._limits.pop(life, None)
 
     def halted(self, robot: str) -> bool:
@@ -82,17 +84,23 @@ class Checker:
     def _seen(self, robot: str, life: str, sequence: int) -> None:
         """A life shows how many actions it has executed."""
         before = self._sequences.get(life)
-        if self._halts[robot] and before is None:
-            # It began under the halt: anew, or where a clean stop left off.
-            left_off = {
-                self._sequences[other] for other, its in self._lives.items() if its == robot
-            }
-            self._limits[life] = sequence if sequence in left_off else 0
-        if self._halts[robot] and sequence > self._limits.get(life, sequence):
-            limit = self._limits[life]
-            self._violated(f"{robot} (life {life}) moved under a halt: {sequence} actions, {limit}")
+        if self._halts[robot]:
+            limit = self._limits.setdefault(life, self._allowed(robot, life, sequence))
+            if sequence > limit:
+                self._violated(f"{robot} (life {life}) moved under a halt: {sequence}, not {limit}")
         self.actions += max(0, sequence - (sequence if before is None else before))
         self._lives[life], self._sequences[life] = robot, sequence
+
+    def _allowed(self, robot: str, life: str, sequence: int) -> int:
+        """Highest sequence that a life may show that is first heard of under a halt."""
+        if life in self._sequences:  # it was there before
+            return sequence + UNDER_WAY
+        # It began under the halt: anew, or where a clean stop left off.
+        left_off = [self._sequences[other] for other in self._lives_of(robot)]
+        return sequence if sequence in left_off else 0
+
+    def _lives_of(self, robot: str) -> list[str]:
+        return [life for life, its in self._lives.items() if its == robot]
 
     def _stands(self, state: RobotState) -> None:
         """Hold a heartbeat under a halt against those before."""
@@ -102,7 +110,7 @@ class Checker:
             return
         expected = "estop" if "estop" in kinds else "paused"
         if state.state == expected:
-            self._limits.setdefault(state.life, state.sequence)
+            self._limits[state.life] = min(state.sequence, self._limits[state.life])
         elif before is not None and before.state == expected and state.state != "estop":
             self._violated(f"{state.robot} (life {state.life}) says {state.state} under a halt")
 

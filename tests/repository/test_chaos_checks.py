@@ -50,6 +50,17 @@ def test_a_motion_under_a_halt_is_found() -> None:
     assert "moved under a halt" in checker.violations[0]
 
 
+def test_a_driver_that_does_not_say_that_it_stands_is_found_when_it_drives_on() -> None:
+    checker = Checker([ROBOT])
+    checker.hear(make_observation(4, life=LIFE))
+    checker.held("estop", [ROBOT])
+    for sequence in (20, 21, 22):  # some were not heard, some are under way
+        checker.hear(make_observation(sequence, life=LIFE))
+    assert checker.violations == []
+    checker.hear(make_observation(23, life=LIFE))
+    assert len(checker.violations) == 1
+
+
 def test_a_halt_that_a_robot_forgets_is_found() -> None:
     checker = halted()
     checker.hear(heartbeat("waiting", 7))
