@@ -104,7 +104,12 @@ class Bus:
     @property
     def connected(self) -> bool:
         """Whether a router answers now; one that is gone or hangs counts until its lease ends."""
-        return bool(self._session.info.routers_zid())
+        return bool(self.router)
+
+    @property
+    def router(self) -> str:
+        """Which router answers now; another one after it was restarted. Empty without one."""
+        return " ".join(map(str, self._session.info.routers_zid()))
 
     def inbox(self) -> Inbox:
         """A new inbox for one thread."""

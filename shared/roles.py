@@ -4,7 +4,8 @@ On one machine the lock on a file of the run folder decides, which the kernel le
 process ends. Between machines a claim on the bus decides: a process first announces that it wants
 the role, then looks. It goes on only if nobody holds the role; of several who want it at the same
 time the lowest life gets it. The one that looks second always sees the one that announced first,
-so two never go on. A holder that is gone, or frozen, loses the role with its lease.
+so two never go on. A holder that is gone, or frozen, loses the role with its lease. A holder that
+was cut off when another one looked is not seen: of two that meet afterwards the older one stays.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from shared.bus import Bus
 
 POLL_S, PING_S, MARGIN_S = 0.02, 0.5, 0.5
+ALIKE_S = 1.0
+"""Ages that differ by less are alike: each process learns of the other's a little later."""
 
 
 @contextmanager
@@ -80,6 +83,12 @@ def holder(bus: Bus, service: str, ident: str, life: str) -> str | None:
             if reply.life in others:
                 return f"{reply.host}, process {reply.pid}, life {reply.life}"
     return ""
+
+
+def older(other: ServiceReply, own: ServiceReply) -> bool:
+    """Whether the other one of two processes has their role for longer; the lower life if alike."""
+    ahead_s = other.uptime_s - own.uptime_s
+    return ahead_s > ALIKE_S or (ahead_s > -ALIKE_S and other.life < own.life)
 
 
 def _rival(bus: Bus, service: str, ident: str, life: str) -> str | None:

@@ -34,12 +34,14 @@ from shared.errors import (
 from shared.halts.keeper import HaltKeeper
 from shared.inbox import Inbox
 from shared.keys import PING, STOP
-from shared.messages import PROTOCOL_VERSION, ServiceReply, StopService
+from shared.messages import PROTOCOL_VERSION, Ping, ServiceReply, StopService
 
 VERSION = "0.1.0"
 EXIT_OK, EXIT_CRASH, EXIT_CONFIG, EXIT_STATE, EXIT_ROLE = 0, 1, 2, 3, 4
 REJOIN_S = 10.0
 """After a sleep longer than its lease a process looks so long whether its role was taken."""
+SETTLE_S = 3.0
+"""Two processes that have met in one role compare their ages after this time, and again."""
 TICK_S = 0.2
 """Longest a service waits before it looks at its stop flag."""
 T = TypeVar("T")
@@ -114,6 +116,7 @@ class Service:
         """Answer `ping` and `stop`, and watch over the role (runs in a thread of its own)."""
         inbox = self.control
         known, looked_s, woke_s = frozenset({self.life}), time.monotonic(), -math.inf
+        asked_s = looked_s
         while not self.stop.is_set():
             inbox.wait(TICK_S)
             for request in inbox.requests():
@@ -133,6 +136,16 @@ class Service:
                 # The role ended with the lease: whoever has it now keeps it.
                 self.taken_by = ", ".join(sorted(known - {self.life}))
                 self.stop.set("slept longer than its lease, and its role is taken by life")
+            elif len(known) == 1:
+                asked_s = looked_s
+            elif looked_s - asked_s > SETTLE_S:
+                asked_s = looked_s
+                ident = f"{self.name}-{self.ident}"
+                inbox.ask_all(PING, Ping(), ident=ident, timeout_s=SETTLE_S)
+            for reply in inbox.answers(ServiceReply):
+                if reply.life in known and roles.older(reply, self.describe()):
+                    self.taken_by = reply.life
+                    self.stop.set("met an older process in its role: life")
 
     def describe(self) -> ServiceReply:
         """Who this service is."""

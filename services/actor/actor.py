@@ -123,13 +123,11 @@ class Actor:
     def committed(self, progress: RobotProgress) -> None:
         """The last submission is on disk: continue from there."""
         self.progress = progress
-        self.submissions += 1
         self._unreported_samples = self._unreported_episodes = 0
 
     def lose(self, episode: Episode) -> None:
         """The last submission was refused for good: its samples are lost, and counted."""
         self.progress = None
-        self.submissions += 1
         self._drop(samples=episode.count, episodes=1)
 
     def act(self, observation: Observation, values: Values | None = None) -> Action:
@@ -284,10 +282,11 @@ class Actor:
         before, self._laps_before = self._laps_before, laps
         released = steps[: release.count]
         settled = steps if release.ending == "interrupted" else released
+        number, self.submissions = self.submissions, self.submissions + 1
         return Episode(
             robot=self._robot,
             life=self.life,
-            number=self.submissions,
+            number=number,
             fill=self.filling,
             ended=release.ending,
             bump=bump,

@@ -107,7 +107,7 @@ class DriverLoop:
         self._inbox.serve(ROBOT_WORLD, self._robot)
         self._inbox.subscribe(ACTION, self._robot)
         me.stop.on_set(self._inbox.wake)
-        self._next_beat_s, self._heard_s = 0.0, clock_s()
+        self._next_beat_s, self._heard_s, self._router = 0.0, clock_s(), ""
         self._halts = KeptBook(folder, me.name, me.ident, me.life, self._robot)
         host.attach(self)
 
@@ -146,6 +146,7 @@ class DriverLoop:
 
     def _learn_of_halts(self) -> None:
         """Before the robot moves (again): stand if any service that is there knows of a halt."""
+        self._router = self.me.bus.router
         self._hold()
         others = {peer.life for peer in self.me.bus.peers()} - {self.me.life}
         until_s = time.monotonic() + LEARN_S
@@ -162,12 +163,14 @@ class DriverLoop:
     def _taken(self, action: Action) -> bool:
         """Whether this action answers the newest observation and may be carried out.
 
-        After a silence, in which driver or network may have been away, halts are asked for first.
+        After a silence, or with another router, halts are asked for first: driver or network may
+        have been away. Without a router nobody could stop the robot.
         """
-        if not self._driver.answers(action):
+        router = self.me.bus.router
+        if not self._driver.answers(action) or not router:
             return False
         silent_s, self._heard_s = clock_s() - self._heard_s, clock_s()
-        if silent_s > self._config.bus.lease_ms / 1000:
+        if router != self._router or silent_s > self._config.bus.lease_ms / 1000:
             self._learn_of_halts()
         return not self._driver.safety.halted and self._driver.attempt == action.attempt
 

@@ -15,6 +15,8 @@ from pathlib import Path
 from services.security.use import refuse_open_door
 from shared.bus import open_router
 
+TICK_S = 0.2
+"""Python takes up a signal only where its main thread runs, and the signal may wake another one."""
 log = logging.getLogger(__name__)
 
 
@@ -48,5 +50,6 @@ def run(
     with open_router(endpoint, file) as locator:
         log.info("router listens on %s", locator)
         announce(locator)
-        stop.wait()
+        while not stop.wait(TICK_S):
+            pass
     log.info("router stops")

@@ -12,9 +12,9 @@ import pytest
 from cluster import ALL, Cluster, make_config
 
 from benchmarks.waiting import wait_until
-from shared import roles
+from shared import roles, service
 from shared.bus import Bus
-from shared.config import BusConfig
+from shared.config import BusConfig, Config
 from shared.errors import RoleTaken
 from shared.keys import ACTION
 from shared.messages import PROTOCOL_VERSION, Action
@@ -55,6 +55,28 @@ def test_of_several_who_want_a_role_at_once_one_gets_it(router: str, run_name: s
         assert [peer.life for peer in winners[0].bus.peers()] == [winners[0].life]
         for claimant in several:
             claimant.bus.close()
+
+
+def test_of_two_that_meet_in_one_role_the_older_one_stays(
+    router: str, run_name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As when the router was away while the second one looked."""
+    monkeypatch.setattr(service, "SETTLE_S", 0.5)
+    config = Config.model_validate({"run": {"name": run_name}, "bus": {"endpoint": router}})
+    with Bus(config.bus, run_name) as first, Bus(config.bus, run_name) as second:
+        lives = ("f" * 12, "0" * 12)
+        old, young = (
+            service.Service("actor", "main", life, config, bus, service.StopFlag())
+            for life, bus in zip(lives, (first, second), strict=True)
+        )
+        old.started_s -= 60.0
+        for me in (old, young):
+            me.bus.announce("actor", "main", me.life, PROTOCOL_VERSION, "0" * 16)
+        with service.controlled(old), service.controlled(young):
+            wait_until(young.stop.is_set, 30, "the younger one stops")
+            assert young.taken_by == old.life
+            assert not old.stop.is_set()
+        assert old.taken_by == ""
 
 
 @pytest.fixture

@@ -49,6 +49,16 @@ def test_prints_its_endpoint_and_ends_cleanly_on_signals(number: signal.Signals)
         assert process.wait(5) == 0
 
 
+@pytest.mark.parametrize("attempt", range(6))
+def test_ends_on_a_signal_that_came_while_it_was_frozen(attempt: int) -> None:
+    """Any of its threads may get that signal."""
+    with running() as (process, endpoint), Bus(BusConfig(endpoint=endpoint), "test"):
+        process.send_signal(signal.SIGSTOP)
+        process.send_signal(signal.SIGTERM)
+        process.send_signal(signal.SIGCONT)
+        assert process.wait(30) == 0
+
+
 def test_ends_when_its_tether_is_cut() -> None:
     with running("--tethered") as (process, _):
         assert process.stdin is not None

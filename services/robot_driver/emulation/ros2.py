@@ -322,6 +322,7 @@ def run(
     emulated = EmulatedRos2(config, world, listen, faults)
     try:
         ready(emulated.endpoint)
-        stop.wait()
+        while not stop.wait(0.2):  # a signal that another thread got is taken up only here
+            pass
     finally:
         emulated.close()

@@ -13,7 +13,7 @@ from builders import FakePredictor, make_config, make_observation
 
 from services.actor.courier import Delivery
 from services.actor.session import Newest, Session
-from shared.messages import Action, EpisodeAck, LearnerState, RobotProgress, image_array
+from shared.messages import Action, Episode, EpisodeAck, LearnerState, RobotProgress, image_array
 
 LEARNER = LearnerState(
     id="main",
@@ -49,6 +49,7 @@ class Rig:
 
     def __init__(self, timing: str, folder: Path) -> None:
         self.published: list[Action] = []
+        self.sent: list[Episode] = []
         self.on_its_way: Future[Delivery] = Future()
         me = SimpleNamespace(
             config=make_config(robot={"timing": timing}),
@@ -59,7 +60,7 @@ class Rig:
         weights = SimpleNamespace(newest=(1, b""), refused=0)
         asked: Future[RobotProgress] = Future()
         asked.set_result(progress(0))
-        courier = SimpleNamespace(send=lambda _: self.on_its_way, ask=lambda _: asked)
+        courier = SimpleNamespace(send=self._send, ask=lambda _: asked)
         newest = Newest(LEARNER)
         path = folder / "robot1.msgpack"
         given: tuple[Any, ...] = (
@@ -74,6 +75,10 @@ class Rig:
             set,
         )
         self.session = Session(*given)
+
+    def _send(self, episode: Episode) -> Future[Delivery]:
+        self.sent.append(episode)
+        return self.on_its_way
 
     def see(self, sequence: int, **given: Any) -> None:
         """Let an observation come, and answer it if it may be answered."""
@@ -106,3 +111,21 @@ def test_a_robot_is_held_while_its_episode_is_on_its_way(timing: str, tmp_path: 
     assert rig.published[-1].action is not None
     assert rig.published[-1].attempt == 2
     assert rig.session.actor.dropped_samples == 0
+
+
+def test_the_episodes_of_a_life_are_numbered_from_0_whatever_it_took_over(tmp_path: Path) -> None:
+    before = Rig("lockstep", tmp_path)
+    before.see(0)
+    before.see(1, bump=True)
+    before.session.save()  # a clean stop, while the episode is on its way
+    after = Rig("lockstep", tmp_path)
+    after.published += before.published
+    ack = EpisodeAck(accepted=True, commit=1, episode=1, stored=1, progress=progress(1))
+    after.on_its_way.set_result(Delivery(ack, attempts=1))
+    after.see(1, bump=True)
+    after.see(2, bump=True)
+    lives = [before.session.actor.life, after.session.actor.life]
+    assert [(episode.life, episode.number) for episode in after.sent] == [
+        (lives[0], 0),
+        (lives[1], 0),
+    ]

@@ -76,6 +76,9 @@ class FakeBus:
         self.actions: list[Action] = []
         self.commands: list[Request] = []
         self.refused_total = self.busy_total = 0
+        self.router = "1"
+        self.asked = 0
+        """How often halts in force were asked for."""
         self._woken = threading.Event()
 
     def inbox(self) -> FakeBus:
@@ -84,7 +87,10 @@ class FakeBus:
     def subscribe(self, *_: object, **__: object) -> None:
         pass
 
-    serve = ask_all = subscribe
+    serve = subscribe
+
+    def ask_all(self, *_: object, **__: object) -> None:
+        self.asked += 1
 
     def answers(self, *_: object) -> list[Any]:
         return []
@@ -377,3 +383,23 @@ def test_a_closed_terminal_is_a_clean_end() -> None:
         text = f"import signal; signal.signal(signal.SIGHUP, signal.{before})\n{text}"
         done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True)
         assert done.stdout.startswith(said), done.stderr
+
+
+def test_halts_are_asked_for_again_when_the_router_is_another_one(tmp_path: Path) -> None:
+    with standing(tmp_path) as stand:
+        stand.answer(0)
+        stand.until(lambda: stand.driver.sequence == 1, "an action")
+        assert stand.bus.asked == 1
+        stand.bus.router = "2"
+        stand.answer(0)
+        stand.until(lambda: stand.driver.sequence == 2, "another action")
+        assert stand.bus.asked == 2
+
+
+def test_nothing_is_driven_while_there_is_no_router(tmp_path: Path) -> None:
+    with standing(tmp_path) as stand:
+        stand.bus.router = ""
+        for _ in range(3):
+            stand.answer(0)
+        stand.until(lambda: stand.driver.late_actions >= 3, "periods without an action")
+        assert not stand.moved

@@ -53,7 +53,7 @@ class Forked:
         os.kill(self._process.pid, number)
 
     def kill(self) -> None:
-        """kill -9; nothing happens if it has ended."""
+        """SIGKILL, as by `kill -9`; nothing happens if it has ended."""
         self._process.kill()
 
     def wait(self, timeout_s: float) -> int:
