@@ -11,6 +11,7 @@ import pytest
 from cluster import ALL, Cluster, make_config
 from comparison import Outcome, assert_equal, distributed, single_process
 
+from services.cli import main as cli
 from shared.config import Config
 
 EPISODES = 40
@@ -107,3 +108,17 @@ def test_clean_stops_and_resumes_still_end_equal(
         cluster.wait_episodes(EPISODES, 200)
         cluster.stop_all()
     assert_equal(reference, distributed(config, tmp_path / "run"))
+
+
+@pytest.mark.slow
+def test_an_encrypted_run_equals_the_single_process_loop(
+    config: Config, reference: Outcome, tmp_path: Path
+) -> None:
+    assert cli.main(["secure", "init", str(tmp_path / "secure"), "--robot", "robotino1"]) == 0
+    bus = config.bus.model_copy(update={"credentials": str(tmp_path / "secure")})
+    guarded = config.model_copy(update={"bus": bus})
+    with Cluster(guarded, tmp_path / "run") as cluster:
+        cluster.start(*ALL)
+        cluster.wait_episodes(EPISODES, 200)
+        cluster.stop_all()
+    assert_equal(reference, distributed(guarded, tmp_path / "run"))
