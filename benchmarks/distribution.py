@@ -13,6 +13,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from statistics import median
 
@@ -22,6 +23,10 @@ from services.launcher.supervisor import ChildSpec, Supervisor
 from services.launcher.up import child_specs, free_endpoint
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import load_world
+from services.security import router_file
+from services.security.authority import Authority
+from services.security.kinds import Credential
+from services.security.use import using
 from shared import settings
 from shared.bus import Bus
 from shared.config import ActorNumerics, Config, Numerics
@@ -31,6 +36,7 @@ from shared.keys import OBSERVATION
 from shared.messages import Observation
 from shared.numerics import choose
 
+DRIVER = ("driver", "robotino1")
 WARM_UP_STEPS = 100
 PATIENCE_S = 600.0
 POLL_S = 0.1
@@ -84,6 +90,18 @@ def system_rate(config: Config, steps: int, robots: int) -> float:
             return (counted.look() - before) / (time.perf_counter() - start_s)
 
 
+def encrypted_rate(config: Config, steps: int) -> float:
+    """The same with one robot, behind a router that lets in certificates only."""
+    with tempfile.TemporaryDirectory() as place:
+        authority, until = Authority.create(Path(place)), datetime.now(UTC) + timedelta(days=1)
+        authority.certify_router([], until)
+        for kind, *robots in (("replay",), ("learner",), ("actor",), ("operator",), DRIVER):
+            authority.add(Credential(kind, tuple(robots)), until)
+        router_file.write(authority)
+        bus = config.bus.model_copy(update={"credentials": place})
+        return system_rate(config.model_copy(update={"bus": bus}), steps, 1)
+
+
 def more_robots(specs: list[ChildSpec], robot: str) -> ChildSpec:
     """A further simulated robot of the same run."""
     driver = next(spec for spec in specs if spec.name == "driver")
@@ -96,7 +114,7 @@ def connected(config: Config) -> Bus:
     deadline_s = time.monotonic() + PATIENCE_S
     while True:
         try:
-            return Bus(config.bus, config.run.name)
+            return Bus(using(config, "operator").bus, config.run.name)
         except RouterMissing:
             if time.monotonic() > deadline_s:
                 raise
@@ -134,22 +152,26 @@ class Steps:
 
 
 def measure(mode: Mode) -> tuple[list[list[object]], list[Bar]]:
-    """Rates of all cases in turns: rows for the table, and the bars P5a and P5b."""
+    """Rates of all cases in turns: rows for the table, and the bars P5a to P5c."""
     steps = {"check": 50, "short": 2000, "full": 5000}[mode]
     config = configuration(filters=4 if mode == "check" else 64)
     robots = 2 if mode == "check" else 4
-    rates: dict[str, list[float]] = {"one process": [], "system, 1 robot": [], "system, n": []}
+    cases = ("one process", "system, 1 robot", "system, encrypted", "system, n")
+    rates: dict[str, list[float]] = {name: [] for name in cases}
     rounds = rounds_of(mode, 2, 3) if mode != "check" else 1
     for _ in range(rounds):
         rates["one process"].append(single_process_rate(config, steps))
         rates["system, 1 robot"].append(system_rate(config, steps, 1))
+        rates["system, encrypted"].append(encrypted_rate(config, steps))
         rates["system, n"].append(system_rate(config, steps, robots))
-    single, one, many = (median(rates[name]) for name in rates)
+    single, one, guarded, many = (median(rates[name]) for name in cases)
     bars = [
         Bar("P5a", one / single, "x", "higher", 0.6, 0.85, single, one, rounds),
+        Bar("P5c", guarded / one, "x", "higher", 0.9, 1.0, one, guarded, rounds),
         Bar("P5b", many / single, "x", "higher", 1.3, 1.8, single, many, rounds),
     ]
-    named = [["one process", single], ["system, 1 robot", one], [f"system, {robots} robots", many]]
+    named: list[tuple[str, float]] = [*zip(cases[:3], (single, one, guarded), strict=True)]
+    named.append((f"system, {robots} robots", many))
     return [[name, rate, 1e3 / rate] for name, rate in named], bars
 
 
