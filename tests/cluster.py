@@ -16,6 +16,7 @@ from forked import Forked
 
 from benchmarks.waiting import wait_until
 from services import processes
+from services.security.use import using
 from shared import settings
 from shared.bus import Bus
 from shared.config import Config
@@ -159,7 +160,7 @@ class Cluster:
 
     @property
     def bus(self) -> Bus:
-        """A client of the cluster's router, connected on first use."""
+        """A client of the cluster's router, an operator, connected on first use."""
         if self._bus is None:
             self._bus = wait_until(self._connect, 20, "router answers")
             self._inbox = self._bus.inbox()
@@ -204,7 +205,7 @@ class Cluster:
         from shared.errors import RouterMissing
 
         try:
-            return Bus(self.config.bus, self.config.run.name)
+            return Bus(using(self.config, "operator").bus, self.config.run.name)
         except RouterMissing:
             return None
 
