@@ -93,6 +93,7 @@ class WeightsFetcher(threading.Thread):
             self._network = QNetwork(me.config.network)
         self._inbox = me.bus.inbox()
         self._inbox.subscribe(LEARNER_STATE, "main")
+        self._inbox.watch("learner", "main")
         self._newer = threading.Condition()
         self._newest: tuple[int, bytes] = (0, b"")
         self._wanted = Wanted()
@@ -126,8 +127,10 @@ class WeightsFetcher(threading.Thread):
             if wanted.version <= self._newest[0] or waiting_s:
                 self._inbox.wait(min(waiting_s or TICK_S, TICK_S))
             for _, state in self._inbox.take(LEARNER_STATE, LearnerState):
-                wanted.note(state.weights_version)
-                self.heard = (state.weights_version, time.monotonic())
+                lives = self._inbox.lives("learner", "main")
+                if not lives or state.life in lives:
+                    wanted.note(state.weights_version)
+                    self.heard = (state.weights_version, time.monotonic())
             if wanted.version > self._newest[0] and not wanted.due_s(time.monotonic()):
                 self._fetch()
 

@@ -160,7 +160,7 @@ class Cluster:
 
     @property
     def bus(self) -> Bus:
-        """A client of the cluster's router, an operator, connected on first use."""
+        """A client of the cluster's router, connected on first use, as an operator."""
         if self._bus is None:
             self._bus = wait_until(self._connect, 20, "router answers")
             self._inbox = self._bus.inbox()

@@ -13,7 +13,7 @@ import zenoh
 DEADLINE_S = 60.0
 
 
-def pack(name: str, **fields: Any) -> bytes:
+def pack(name: str, /, **fields: Any) -> bytes:
     return msgpack.packb({"v": 2, "t": name, **fields})
 
 
