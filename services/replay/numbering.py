@@ -137,7 +137,7 @@ def refusal(
     if episode.fill and (config.fill == "none" or (known is not None and known.filled)):
         return "fill: the memory is not being filled, submit with fill = false"
     first = episode.last_sequence - episode.count + 1
-    for begin, end in spans:
+    for begin, end in ((first, -1), *spans):
         if first <= end and begin <= episode.last_sequence:
             return (
                 f"sequences: {episode.count} samples up to {episode.last_sequence} of robot life "
