@@ -191,10 +191,12 @@ class Bus:
         *types: type[M],
         ident: str = "main",
         timeout_s: float | None = None,
+        everybody: bool = False,
     ) -> Iterator[M]:
         """Ask once and yield the answers as they come. Raises like `request`.
 
-        Zenoh ends a broken transfer without an error: the caller checks that it is complete.
+        Zenoh ends a broken transfer without an error: the caller checks that it is complete. With
+        `everybody` it asks all who serve the stream, and errors of some do not matter.
         """
         key = stream.key(self.run, ident)
         replies = self._session.get(
@@ -204,9 +206,12 @@ class Bus:
             consolidation=zenoh.ConsolidationMode.NONE,
             congestion_control=zenoh.CongestionControl.BLOCK,
             timeout=timeout_s or self.config.request_timeout_s,
+            target=zenoh.QueryTarget.ALL if everybody else zenoh.QueryTarget.BEST_MATCHING,
         )
         answered = False
         for reply in replies:
+            if reply.ok is None and everybody:
+                continue
             answered = True
             if reply.ok is None:
                 raise _failure(key, reply)

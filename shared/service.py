@@ -19,6 +19,7 @@ from typing import TypeVar
 
 from shared import roles
 from shared.bus import Bus
+from shared.complaints import Complaints
 from shared.config import Config
 from shared.errors import (
     BadMessage,
@@ -117,6 +118,7 @@ class Service:
         inbox = self.control
         known, looked_s, woke_s = frozenset({self.life}), time.monotonic(), -math.inf
         asked_s = looked_s
+        complaints = Complaints(self.log.error)
         while not self.stop.is_set():
             inbox.wait(TICK_S)
             for request in inbox.requests():
@@ -127,7 +129,7 @@ class Service:
             lives = inbox.lives(self.name, self.ident)
             for life in lives - known:
                 self.rivals += 1
-                self.log.error("another %s %r is here: life %s", self.name, self.ident, life)
+                complaints.tell("rival", f"another {self.name} {self.ident!r} is here: life {life}")
             known = lives | {self.life}
             away_s, looked_s = time.monotonic() - looked_s, time.monotonic()
             if away_s > self.config.bus.lease_ms / 1000:

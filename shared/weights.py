@@ -34,13 +34,18 @@ def parts(version: int, data: bytes, digest: str) -> Iterator[Weights]:
         yield Weights(version=version, hash=digest, part=part, parts=len(chunks), data=chunk)
 
 
-def fetch(bus: Bus) -> tuple[int, bytes]:
-    """The newest version and its safetensors bytes. Raises BusError or BadMessage."""
+def fetch(bus: Bus, *, everybody: bool = False) -> tuple[int, bytes]:
+    """The newest version and its safetensors bytes. Raises BusError or BadMessage.
+
+    everybody: ask all who serve weights, in place of the one that the router chooses.
+    """
     received, digest, size = [], WeightsHash(), 0
-    for message in bus.request_many(WEIGHTS, WeightsRequest(), Weights):
+    for message in bus.request_many(WEIGHTS, WeightsRequest(), Weights, everybody=everybody):
         digest.add(message.data)  # while the next part is on its way
         received.append(message)
         size += len(message.data)
+        if everybody and len(received) == message.parts:
+            break  # whoever is asked beside is not waited for
         if size > MAX_WEIGHT_BYTES or len(received) > message.parts:
             raise BadMessage(f"weights: more than {message.parts} parts or too many bytes")
     first = received[0]
@@ -93,9 +98,12 @@ class WeightsFetcher(threading.Thread):
             self._network = QNetwork(me.config.network)
         self._inbox = me.bus.inbox()
         self._inbox.subscribe(LEARNER_STATE, "main")
+        self._inbox.watch("learner", "main")
         self._newer = threading.Condition()
         self._newest: tuple[int, bytes] = (0, b"")
         self._wanted = Wanted()
+        self._silent = False
+        """The router has chosen somebody who does not answer, such as a learner that is gone."""
         self._complaints = Complaints(log.warning)
         self.refused = 0
         """Answers that were no weights of this run's network."""
@@ -126,18 +134,21 @@ class WeightsFetcher(threading.Thread):
             if wanted.version <= self._newest[0] or waiting_s:
                 self._inbox.wait(min(waiting_s or TICK_S, TICK_S))
             for _, state in self._inbox.take(LEARNER_STATE, LearnerState):
-                wanted.note(state.weights_version)
-                self.heard = (state.weights_version, time.monotonic())
+                lives = self._inbox.lives("learner", "main")
+                if not lives or state.life in lives:
+                    wanted.note(state.weights_version)
+                    self.heard = (state.weights_version, time.monotonic())
             if wanted.version > self._newest[0] and not wanted.due_s(time.monotonic()):
                 self._fetch()
 
     def _fetch(self) -> None:
         """One attempt to have something newer."""
         try:
-            version, data = fetch(self._me.bus)
+            version, data = fetch(self._me.bus, everybody=self._silent)
             checked(self._network, data)
         except BusError as error:
             log.debug("weights not fetched: %s", error)
+            self._silent = isinstance(error, PeerSilent)
             self._wanted.missed(time.monotonic(), answered=False)
             return
         except (BadMessage, ValueError) as error:

@@ -125,9 +125,14 @@ class Actor:
         self.progress = progress
         self._unreported_samples = self._unreported_episodes = 0
 
-    def lose(self, episode: Episode) -> None:
-        """The last submission was refused for good: its samples are lost, and counted."""
+    def lose(self, episode: Episode, life: str) -> None:
+        """The last submission was refused for good: its samples are lost, and counted.
+
+        life: under which to go on. Somebody else may have used up the numbers of the one before.
+        """
         self.progress = None
+        self.life, self.submissions = life, 0
+        self._lives.add(life)
         self._drop(samples=episode.count, episodes=1)
 
     def act(self, observation: Observation, values: Values | None = None) -> Action:

@@ -14,6 +14,7 @@ from services.actor.courier import Courier
 from services.actor.session import Newest, Session
 from services.actor.targets import Targets
 from services.processes import ACTOR, DRIVER, LEARNER, MAIN
+from shared.complaints import Complaints
 from shared.config import Config, Numerics
 from shared.errors import CorridorError
 from shared.inbox import Inbox
@@ -58,6 +59,7 @@ class ActorLoop:
         """Robots that had a session of this process."""
         self._failed: dict[str, float] = {}
         """When the session of a robot ended with an error."""
+        self._complaints = Complaints(me.log.warning)
         self._inbox: Inbox = me.bus.inbox()
         for robot in me.config.run.robots or ("*",):
             self._inbox.subscribe(OBSERVATION, robot)
@@ -76,13 +78,18 @@ class ActorLoop:
         while not self._me.stop.is_set():
             self._inbox.wait(TICK_S)
             for _, state in self._inbox.take(LEARNER_STATE, LearnerState):
-                self._newest.note(state, self._inbox.lives(LEARNER.name, MAIN))
+                if not self._newest.note(state, self._inbox.lives(LEARNER.name, MAIN)):
+                    self._inbox.refused[LEARNER_STATE.name] += 1
+                    self._complaints.tell("learner", f"learner {state.life} has not the role")
             for robot, observation in self._inbox.take(OBSERVATION, Observation):
                 if self._has_room(robot):
                     with self._alone(robot):
                         self._session(robot).offer(observation)
                 else:
                     self._inbox.busy[OBSERVATION.name] += 1
+                    self._complaints.tell(
+                        "room", f"robot {robot!r} is not served: no room, or a rest"
+                    )
             self._answer()
             self._beat()
 
@@ -93,7 +100,16 @@ class ActorLoop:
             return False
         failed_s = self._failed.get(robot, -AGAIN_S)
         rested = time.monotonic() - failed_s > AGAIN_S
+        if robot not in self._sessions and len(self._sessions) >= MAX_ROBOTS:
+            self._forget_one()
         return robot in self._sessions or (rested and len(self._sessions) < MAX_ROBOTS)
+
+    def _forget_one(self) -> None:
+        """End the session of a robot that nobody drives any more, as far as can be heard."""
+        for robot, session in self._sessions.items():
+            if session.silent and not self._inbox.lives(DRIVER.name, robot):
+                del self._sessions[robot]
+                return
 
     @contextmanager
     def _alone(self, robot: str) -> Iterator[None]:
@@ -142,7 +158,10 @@ class ActorLoop:
                 self._courier,
                 lambda: self._inbox.lives(DRIVER.name, robot),
             )
-            self._me.log.info("serving robot %r", robot)
+            if self._inbox.lives(DRIVER.name, robot):
+                self._me.log.info("serving robot %r", robot)
+            else:
+                self._complaints.tell("stranger", f"serving robot {robot!r}, which has no token")
         return self._sessions[robot]
 
     def _beat(self) -> None:

@@ -14,6 +14,7 @@ from services.actor.courier import Courier, Delivery
 from services.actor.targets import Targets
 from shared import statefile
 from shared.codec import decode, encode
+from shared.complaints import Complaints
 from shared.errors import BadMessage, PeerRefused, StateError
 from shared.facts import ACTION_COUNT
 from shared.keys import ACTION
@@ -26,7 +27,7 @@ from shared.messages import (
     RobotProgress,
 )
 from shared.rl.policy import Values
-from shared.service import Service
+from shared.service import Service, new_life
 from shared.weights import WeightsFetcher
 
 RIVAL_SILENT_S = 2.0
@@ -40,13 +41,15 @@ class Newest:
 
     state: LearnerState | None = None
 
-    def note(self, state: LearnerState, lives: Collection[str]) -> None:
+    def note(self, state: LearnerState, lives: Collection[str]) -> bool:
         """Take over a state, unless it is of none of the lives that have the learner's role.
 
-        Without any token of a learner each is believed.
+        Without any token of a learner each is believed. Returns whether this one is.
         """
-        if not lives or state.life in lives:
+        believed = not lives or state.life in lives
+        if believed:
             self.state = state
+        return believed
 
 
 class Session:
@@ -86,6 +89,9 @@ class Session:
         self._answered: tuple[tuple[str, int, int], Action] | None = None
         self._life, self._heard_s = "", 0.0
         """The life that is served, and when it was last heard of."""
+        self._on_s = 0.0
+        """When it last told of the place that was answered last, or of a later one."""
+        self._complaints = Complaints(me.log.warning)
         self.stale_observations = self.rival_observations = 0
         self.resent_episodes = self.refused_episodes = 0
         self._counted = (time.monotonic(), 0)
@@ -97,13 +103,18 @@ class Session:
         """Take an observation from the inbox: new, repeated, outdated, or of a rival."""
         if not self._serves(observation):
             self.rival_observations += 1
+            told = f"{self._robot}: life {observation.life} is not served, {self._life} is"
+            self._complaints.tell("rival", told)
             return
-        place = (observation.life, observation.sequence, observation.attempt)
-        if self._answered is not None and self._answered[0] == place:
-            self._publish(self._answered[1])  # our answer was lost
-            return
-        if self._answered and self._answered[0][0] == place[0] and place < self._answered[0]:
+        place, answered = self._place(observation), self._answered
+        if answered and answered[0][0] == place[0] and place < answered[0]:
             self.stale_observations += 1
+            if self._heard_s - self._on_s < RIVAL_SILENT_S:
+                return
+            self._complaints.tell("back", f"{self._robot} is not at {answered[0]}, but at {place}")
+        self._on_s = self._heard_s
+        if answered and answered[0] == place:
+            self._publish(answered[1])  # our answer was lost
             return
         if self._observation is None or place != self._place(self._observation):
             self._observation = observation
@@ -113,19 +124,24 @@ class Session:
     def _serves(self, observation: Observation) -> bool:
         """Whether this life is the one to serve: one at a time, and none is silenced for good.
 
-        Another life takes over if it continues the one before, if only it has the driver's role, or
-        if the one before has been silent for `RIVAL_SILENT_S`.
+        Another life takes over if only it has the driver's role, if the one before has been silent
+        for `RIVAL_SILENT_S`, or if it continues that one, which has not the role alone.
         """
         now_s, life = time.monotonic(), observation.life
         if life != self._life:
-            present = self._lives()
-            takes_over = life in present and self._life not in present
+            new, old = (each in self._lives() for each in (life, self._life))
             silent = now_s - self._heard_s > RIVAL_SILENT_S
-            if self._life and not (self._life in observation.earlier or takes_over or silent):
+            continues = self._life in observation.earlier and (new or not old)
+            if self._life and not (continues or (new and not old) or silent):
                 return False
             self._life = life
         self._heard_s = now_s
         return True
+
+    @property
+    def silent(self) -> bool:
+        """Whether nothing was heard of the robot for a while."""
+        return time.monotonic() - self._heard_s > RIVAL_SILENT_S
 
     def advance(self) -> Observation | None:
         """Do what can be done now: hand over, wait for training. Raises Stopped and StateError.
@@ -264,7 +280,7 @@ class Session:
         if progress is None:
             self._me.log.error("%s: episode %d lost: %s", self._robot, episode.number, reason)
             self.refused_episodes += 1
-            self.actor.lose(episode)
+            self.actor.lose(episode, new_life())
         else:
             self.actor.committed(progress)
         self._pending = None

@@ -7,6 +7,7 @@ keeps them in a variable.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -14,10 +15,15 @@ import numpy as np
 
 from shared.config import MemoryConfig
 from shared.errors import StateError
-from shared.messages import Episode, RobotProgress
+from shared.messages import MAX_EPISODE_SAMPLES, Episode, RobotProgress
 
 MAX_ROBOTS = 256
 """Robots that one memory keeps numbers of."""
+REACH = 2 * MAX_EPISODE_SAMPLES
+"""The samples of a submission are of actions among this many up to its `last_sequence`."""
+MAX_SPANS = 16
+Span = tuple[int, int]
+"""First and last of the sequences of a driver life that submissions settled."""
 
 
 @dataclass(frozen=True)
@@ -99,14 +105,26 @@ def refill(counters: Counters, config: MemoryConfig, held: int) -> Counters:
     return replace(counters, filled=held) if filling(counters, config) else counters
 
 
+def settled(spans: Sequence[Span], last: int) -> list[Span]:
+    """The spans after a submission, the newest last.
+
+    What is far from all of them begins a span of its own: a number that the driver never reached
+    keeps none of its true ones away.
+    """
+    first = max(last - REACH + 1, 0)
+    near = [span for span in spans if first <= span[1] + 1 and span[0] <= last]
+    others = [span for span in spans if span not in near]
+    return [*others, (min([first, *(a for a, _ in near)]), last)][-MAX_SPANS:]
+
+
 def refusal(
-    counters: Counters, config: MemoryConfig, episode: Episode, newest_sequence: int = -1
+    counters: Counters, config: MemoryConfig, episode: Episode, spans: Sequence[Span] = ()
 ) -> str:
     """Why a submission can never be accepted as it is, after its kind and a colon; empty if it can.
 
-    newest_sequence: `last_sequence` of what is stored of this robot and `robot_life`; -1 if nothing
-    is. The samples of a submission are of executed actions of one driver life, each sample of
-    another one, so at least as many numbers were used up as there are samples.
+    spans: what is settled of this robot and `robot_life`. The samples of a submission are of
+    executed actions of one driver life, each sample of another one, so at least as many numbers
+    were used up as there are samples.
     """
     known = counters.robots.get(episode.robot)
     if known is None and len(counters.robots) >= MAX_ROBOTS:
@@ -119,11 +137,12 @@ def refusal(
     if episode.fill and (config.fill == "none" or (known is not None and known.filled)):
         return "fill: the memory is not being filled, submit with fill = false"
     first = episode.last_sequence - episode.count + 1
-    if first <= newest_sequence:
-        return (
-            f"sequences: {episode.count} samples up to {episode.last_sequence} of robot life "
-            f"{episode.robot_life}, of which all up to {newest_sequence} are stored"
-        )
+    for begin, end in ((first, -1), *spans):
+        if first <= end and begin <= episode.last_sequence:
+            return (
+                f"sequences: {episode.count} samples up to {episode.last_sequence} of robot life "
+                f"{episode.robot_life}, of which all from {begin} to {end} are stored"
+            )
     acted = int(np.frombuffer(episode.sample_versions, "<u4").max())
     if acted > episode.weights_version:
         return f"versions: weights {acted} acted, but {episode.weights_version} predicted"

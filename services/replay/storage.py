@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from services.replay import numbering
 from services.replay.feed import PART_ROWS, Feed
-from services.replay.numbering import Commit, Counters
+from services.replay.numbering import Commit, Counters, Span
 from services.replay.tables import (
     MARKS,
     REWARDS,
@@ -109,9 +109,8 @@ class Storage:
                     raise Refused(f"identity: {identity} is stored with other content")
                 return Accepted(Commit(**record["commit"]), counters, duplicate=True)
             driver = f"{episode.robot}/{episode.robot_life}".encode()
-            settled = txn.get(driver, db=db["lives"])
-            newest = -1 if settled is None else number_of(settled)
-            if reason := numbering.refusal(counters, self._config, episode, newest):
+            spans = _spans(txn.get(driver, db=db["lives"]))
+            if reason := numbering.refusal(counters, self._config, episode, spans):
                 raise Refused(reason)
             lineage = numbering.lineage_after(
                 self._lineage(txn, counters.commit), identity, summary["digest"]
@@ -121,7 +120,8 @@ class Storage:
             record = {"commit": asdict(commit), "totals": _totals(counters), "lineage": lineage}
             txn.put(key_of(commit.commit), pack(record | summary), db=db["commits"])
             txn.put(identity.encode(), key_of(commit.commit), db=db["identity"])
-            txn.put(driver, key_of(episode.last_sequence), db=db["lives"])
+            spans = numbering.settled(spans, episode.last_sequence)
+            txn.put(driver, b"".join(key_of(n) for span in spans for n in span), db=db["lives"])
             self._tables.put_meta(txn, "counters", counters.to_dict())
         return Accepted(commit, counters, duplicate=False)
 
@@ -249,6 +249,13 @@ class Storage:
         for name, *_ in columns():
             memory.rows[name][known] = marks[name][where]
         return memory
+
+
+def _spans(data: bytes | None) -> list[Span]:
+    """What is settled of a driver's life. Once only the last number of one span was kept."""
+    data = bytes(8 * (len(data) == 8)) + data if data else b""
+    numbers = [number_of(data[at : at + 8]) for at in range(0, len(data), 8)]
+    return list(zip(numbers[::2], numbers[1::2], strict=True))
 
 
 def _column(memory: ReplayMemory, dtype: np.dtype[np.void]) -> bytes:

@@ -7,7 +7,7 @@ commits   commit number -> record of the submission (provenance, metrics)
 identity  robot, life, number -> commit number: the deduplication
 images    insertion number -> bytes of the image
 samples   insertion number -> row (reward as inserted)
-lives     robot, driver life -> sequence of the newest action that a submission settled
+lives     robot, driver life -> first and last sequence of spans of actions that are settled
 dead      insertion number -> change number of its discard; kept until the feed forgets the change
 columns   "rewards": all rewards after the newest equalisation; "marks": those of retention
 changes   change number -> kind, ids, lineage of the memory before: the feed

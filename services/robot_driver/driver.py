@@ -333,7 +333,7 @@ class Driver:
 
     def _refused(self, change: WorldChange, reason: str) -> None:
         self.refused_changes += 1
-        self._host.tell(f"world: refused to {described(change)}: {reason}")
+        self._host.complain(f"world: refused to {described(change)}: {reason}")
 
     def _faults(self) -> tuple[Fault, ...]:
         most = self._robot.faults.most_common(MAX_FAULTS)

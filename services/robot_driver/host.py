@@ -19,5 +19,9 @@ class Host:
     def tell(self, line: str) -> None:
         """Log what became of a change of the world."""
 
+    def complain(self, line: str) -> None:
+        """Log that a change of the world was refused; of many, some."""
+        self.tell(line)
+
     def keep(self, kept: dict[str, Any]) -> None:
         """Save what must outlive a kill, before a change of the world is acknowledged."""

@@ -13,6 +13,7 @@ from services.robot_driver.kinds import make_robot
 from services.robot_driver.motion_control import SLICE_S
 from services.robot_driver.robot import NotReady
 from shared import statefile
+from shared.complaints import Complaints
 from shared.config import Config
 from shared.errors import StateError
 from shared.halts.keeper import KeptBook, clock_s
@@ -74,6 +75,7 @@ class ServiceHost(Host):
     def attach(self, loop: DriverLoop) -> None:
         """Take commands and the end of the service from this loop from now on."""
         self._loop = loop
+        self._complaints = Complaints(loop.me.log.warning)
 
     @property
     def stopping(self) -> bool:
@@ -89,6 +91,11 @@ class ServiceHost(Host):
         """Log what became of a change of the world."""
         if self._loop is not None:
             self._loop.me.log.info(line)
+
+    def complain(self, line: str) -> None:
+        """Log the first refusal of a minute."""
+        if self._loop is not None:
+            self._complaints.tell("world", line)
 
     def keep(self, kept: dict[str, Any]) -> None:
         """Write the robot's world to disk."""

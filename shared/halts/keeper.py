@@ -70,10 +70,13 @@ class KeptBook:
         return changed
 
     def join(self, answers: Iterable[Standing]) -> bool:
-        """Take over what others know; whether something is different now."""
+        """Take over the halts that others know of; whether there was a new one.
+
+        What they say was released is not taken over: whoever answers does not release a robot.
+        """
         changed = False
         for answer in answers:
-            changed |= self.book.join(answer.halts, answer.released)
+            changed |= self.book.add(answer.halts)
         if changed:
             self._keep()
         return changed

@@ -7,104 +7,73 @@ another language would build them. Only starting our own services uses our code.
 from __future__ import annotations
 
 import hashlib
-import json
 import queue
 import struct
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-import msgpack
 import pytest
 import zenoh
 from cluster import Cluster, make_config
+from foreign import Client, pack, wait_for
+
+from services.security import router_file
+from services.security.authority import Authority
+from services.security.kinds import Credential
 
 LIFE = "feedc0ffee00"
-DEADLINE_S = 60.0
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
 
 
-def pack(name: str, **fields: Any) -> bytes:
-    return msgpack.packb({"v": 2, "t": name, **fields})
-
-
-class Client:
-    """A foreign program's whole Zenoh layer."""
-
-    def __init__(self, endpoint: str, run: str) -> None:
-        config = zenoh.Config()
-        config.insert_json5("mode", '"client"')
-        config.insert_json5("connect/endpoints", json.dumps([endpoint]))
-        config.insert_json5("scouting/multicast/enabled", "false")
-        self.session, self.run = zenoh.open(config), run
-
-    def subscribe(self, key: str) -> queue.Queue[dict[str, Any]]:
-        received: queue.Queue[dict[str, Any]] = queue.Queue()
-        self.session.declare_subscriber(
-            f"{self.run}/{key}", lambda s: received.put(msgpack.unpackb(s.payload.to_bytes()))
-        )
-        return received
-
-    def ask(self, key: str, payload: bytes) -> list[dict[str, Any]]:
-        """All answers to one request; asked again while nobody serves it."""
-        deadline_s = time.monotonic() + DEADLINE_S
-        while time.monotonic() < deadline_s:
-            replies = self.session.get(
-                f"{self.run}/{key}",
-                zenoh.handlers.FifoChannel(64),
-                payload=payload,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                timeout=10.0,
-            )
-            answers = [msgpack.unpackb(r.ok.payload.to_bytes()) for r in replies if r.ok]
-            if answers:
-                return answers
-        raise AssertionError(f"nobody answers {key}")
-
-    def ask_all(self, key: str, payload: bytes) -> dict[str, dict[str, Any]]:
-        """The answers of all lives, by service and id."""
-        replies = self.session.get(
-            f"{self.run}/{key}",
-            zenoh.handlers.FifoChannel(64),
-            payload=payload,
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=10.0,
-        )
-        answers = [msgpack.unpackb(r.ok.payload.to_bytes()) for r in replies if r.ok]
-        return {f"{answer['service']}-{answer['id']}": answer for answer in answers}
-
-    def refusals(self, key: str, payload: bytes) -> list[dict[str, Any]]:
-        """Error replies to one request."""
-        replies = self.session.get(f"{self.run}/{key}", payload=payload, timeout=10.0)
-        return [msgpack.unpackb(r.err.payload.to_bytes()) for r in replies if r.err]
+GUARDED = pytest.mark.parametrize("cluster", ["open", "guarded"], indirect=True)
+"""Without and with certificates."""
 
 
 @pytest.fixture
-def cluster(tmp_path: Path, run_name: str) -> Iterator[Cluster]:
-    with Cluster(make_config(run_name), tmp_path / "run") as cluster:
+def cluster(request: pytest.FixtureRequest, tmp_path: Path, run_name: str) -> Iterator[Cluster]:
+    config = make_config(run_name)
+    if getattr(request, "param", "open") == "guarded":
+        guard(tmp_path / "secure")
+        bus = config.bus.model_copy(update={"credentials": str(tmp_path / "secure")})
+        config = config.model_copy(update={"bus": bus})
+    with Cluster(config, tmp_path / "run") as cluster:
         cluster.start("router")
         assert cluster.bus
         yield cluster
 
 
+def guard(folder: Path) -> None:
+    """Credentials for our services and for the foreign ones."""
+    authority, until = Authority.create(folder), datetime.now(UTC) + timedelta(days=1)
+    authority.certify_router([], until)
+    for kind, *robots in (
+        *(("replay",), ("learner",), ("actor",), ("operator",), ("driver", "robotino1")),
+        *(("driver", "cube"), ("actor", "cube"), ("pilot", "robotino1")),
+    ):
+        authority.add(Credential(kind, tuple(robots)), until)
+    router_file.write(authority)
+
+
 @pytest.fixture
 def client(cluster: Cluster) -> Iterator[Client]:
-    client = Client(cluster.config.bus.endpoint, cluster.config.run.name)
-    yield client
-    client.session.close()
+    with ExitStack() as stack:
+        yield connect(cluster, "pilot-robotino1", stack)
 
 
-def wait_for(received: queue.Queue[dict[str, Any]], **fields: Any) -> dict[str, Any]:
-    """The next message with these field values."""
-    deadline_s = time.monotonic() + DEADLINE_S
-    while True:
-        message = received.get(timeout=max(deadline_s - time.monotonic(), 0.01))
-        if all(message[name] == value for name, value in fields.items()):
-            return message
+def connect(cluster: Cluster, name: str, stack: ExitStack) -> Client:
+    """A foreign program; where the router is guarded, with the credential of this name."""
+    bus = cluster.config.bus
+    credentials = f"{bus.credentials}/{name}" if bus.credentials else ""
+    client = Client(bus.endpoint, cluster.config.run.name, credentials)
+    stack.enter_context(client.session)
+    return client
 
 
+@GUARDED
 def test_foreign_actor_drives_our_robot_for_50_actions(cluster: Cluster, client: Client) -> None:
     observations = client.subscribe("robot/robotino1/observation")
     cluster.start("driver")
@@ -221,7 +190,19 @@ def test_foreign_client_changes_the_world_of_our_robot(cluster: Cluster, client:
     assert (state["pending_changes"], state["refused_changes"]) == (0, 5)
 
 
-def test_foreign_driver_is_driven_for_50_actions(cluster: Cluster, client: Client) -> None:
+@GUARDED
+def test_foreign_driver_is_driven_for_50_actions(cluster: Cluster) -> None:
+    with ExitStack() as stack:
+        is_driven(cluster, connect(cluster, "driver-cube", stack))
+        (progress,) = connect(cluster, "actor-cube", stack).ask(
+            "replay/main/progress/cube", pack("ProgressRequest", robot="cube")
+        )
+    assert progress["robot_fills"] >= 4
+    assert progress["robot_life"] == LIFE
+
+
+def is_driven(cluster: Cluster, client: Client) -> None:
+    """A robot of nobody's making does what our actor says."""
     actions = client.subscribe("actor/cube/action")
     cluster.start("replay", "learner", "actor")
     x_m, answer = 0.0, None
@@ -255,9 +236,6 @@ def test_foreign_driver_is_driven_for_50_actions(cluster: Cluster, client: Clien
         assert answer["robot_life"] == LIFE
         assert answer["action"] in (0, 1, 2)
         x_m += 0.15
-    progress = client.ask("replay/main/progress/cube", pack("ProgressRequest", robot="cube"))[0]
-    assert progress["robot_fills"] >= 4
-    assert progress["robot_life"] == LIFE
 
 
 def episode(number: int, *, count: int = 3, fill: bool = True, version: int = 1) -> bytes:

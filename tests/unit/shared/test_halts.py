@@ -2,11 +2,25 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import pytest
+from fakes import message
 from hypothesis import given
 from hypothesis import strategies as st
 
 from shared.halts.book import ALL, RELEASE_WITHIN_S, HaltBook, means, new_halt
-from shared.messages import MAX_HALTS, MAX_RELEASED, Deadline, Halt, Release, Released
+from shared.halts.keeper import KeptBook
+from shared.messages import (
+    MAX_HALTS,
+    MAX_RELEASED,
+    Deadline,
+    Halt,
+    Halts,
+    Release,
+    Released,
+    Standing,
+)
 
 ROBOTS = ("a", "b")
 HALTS = st.sampled_from(
@@ -84,3 +98,14 @@ def test_a_release_means_a_life_and_expires() -> None:
     assert not means(release, other, 100.5)
     assert not means(release, life, 102.1)  # it came late
     assert not means(release, life, 102.0 - RELEASE_WITHIN_S - 0.1)  # of a time yet to come
+
+
+@pytest.mark.parametrize("robot", ["", "a"])
+def test_an_answer_brings_halts_and_releases_none(tmp_path: Path, robot: str) -> None:
+    kept = KeptBook(tmp_path, "driver", "a", "1" * 12, robot)
+    halt, other = (Halt(number=number, kind="estop") for number in (1, 2))
+    kept.hear(Halts(halts=(halt,)))
+    told = Released(number=1)
+    answer = message(Standing, service="driver", id="a", halts=(other,), released=(told,))
+    assert kept.join([answer])
+    assert kept.book.halts == (halt, other)

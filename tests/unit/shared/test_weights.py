@@ -31,7 +31,7 @@ def parts(monkeypatch: pytest.MonkeyPatch) -> list[Weights]:
 
 
 def fetched(answers: Sequence[Weights]) -> tuple[int, bytes]:
-    bus: Any = SimpleNamespace(request_many=lambda *_: iter(answers))
+    bus: Any = SimpleNamespace(request_many=lambda *_, **__: iter(answers))
     return weights.fetch(bus)
 
 
@@ -111,7 +111,7 @@ class Learner:
             self._heard.append(message(LearnerState, weights_version=version))
             self._arrived.notify_all()
 
-    def request_many(self, *_: Any) -> Any:
+    def request_many(self, *_: Any, everybody: bool = False) -> Any:
         self.asked += 1
         version, data = self.serves
         return weights.parts(version, data, weights_hash(data))
@@ -121,6 +121,12 @@ class Learner:
 
     def subscribe(self, *_: Any) -> None:
         pass
+
+    def watch(self, *_: Any) -> None:
+        pass
+
+    def lives(self, *_: Any) -> frozenset[str]:
+        return frozenset()
 
     def wake(self) -> None:
         self.announce(1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
@@ -53,6 +54,7 @@ class Rig:
         self.on_its_way: Future[Delivery] = Future()
         me = SimpleNamespace(
             config=make_config(robot={"timing": timing}),
+            log=logging.getLogger("actor"),
             bus=SimpleNamespace(publish=lambda _, action, __: self.published.append(action)),
         )
         predictor = FakePredictor()

@@ -221,6 +221,17 @@ def test_samples_of_one_driver_life_never_overlap(
             memory.storage.commit(later.model_copy(update={**other, "number": 7}))
 
 
+def test_a_submission_far_ahead_of_the_robot_keeps_none_of_its_own_away(memory: Memory) -> None:
+    memory.storage.commit(make_episode(5, seed=0, last_sequence=9))
+    for number in range(40):
+        far = {"number": 100 + number, "last_sequence": 2**32 - 1 - 20_000 * number}
+        memory.storage.commit(make_episode(5, seed=1, **far))
+        own = {"number": 200 + number, "last_sequence": 14 + 5 * number}
+        memory.storage.commit(make_episode(5, seed=2, **own))
+        with pytest.raises(Refused, match="sequences: "):
+            memory.storage.commit(make_episode(5, seed=3, **{**own, "number": 300}))
+
+
 def test_an_earlier_driver_life_is_not_forgotten(memory: Memory) -> None:
     first, second = {"robot_life": "c" * 12}, {"robot_life": "d" * 12}
     memory.storage.commit(make_episode(5, seed=0, last_sequence=9, **first))
