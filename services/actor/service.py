@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from services.actor.courier import Courier
-from services.actor.session import Newest, Session
+from services.actor.heard import Newest
+from services.actor.session import Session
 from services.actor.targets import Targets
 from services.processes import ACTOR, DRIVER, LEARNER, MAIN
 from shared.complaints import Complaints

@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection
 from concurrent.futures import Future
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from services.actor.actor import Actor
 from services.actor.courier import Courier, Delivery
+from services.actor.heard import RIVAL_SILENT_S, Newest, ServedLife
 from services.actor.targets import Targets
 from shared import statefile
 from shared.codec import decode, encode
@@ -30,26 +30,7 @@ from shared.rl.policy import Values
 from shared.service import Service, new_life
 from shared.weights import WeightsFetcher
 
-RIVAL_SILENT_S = 2.0
-"""After this time another life of a robot is served if the one before is not heard any more."""
 Phase = Literal["waiting", "filling", "driving", "handing-over", "training", "stopped"]
-
-
-@dataclass
-class Newest:
-    """The newest announcement of the learner."""
-
-    state: LearnerState | None = None
-
-    def note(self, state: LearnerState, lives: Collection[str]) -> bool:
-        """Take over a state, unless it is of none of the lives that have the learner's role.
-
-        Without any token of a learner each is believed. Returns whether this one is.
-        """
-        believed = not lives or state.life in lives
-        if believed:
-            self.state = state
-        return believed
 
 
 class Session:
@@ -74,7 +55,7 @@ class Session:
         """
         self._me, self._robot, self._path = me, robot, path
         self._newest, self._weights, self._targets = newest, weights, targets
-        self._courier, self._lives = courier, lives
+        self._courier, self._served = courier, ServedLife(lives)
         self._delivery: Future[Delivery] | None = None
         self._asked: Future[RobotProgress] | None = None
         self._restored = False
@@ -87,32 +68,30 @@ class Session:
         self._finished: Observation | None = None
         """The newest observation that was asked whether it ends the open episode."""
         self._answered: tuple[tuple[str, int, int], Action] | None = None
-        self._life, self._heard_s = "", 0.0
-        """The life that is served, and when it was last heard of."""
         self._on_s = 0.0
         """When it last told of the place that was answered last, or of a later one."""
         self._complaints = Complaints(me.log.warning)
         self.stale_observations = self.rival_observations = 0
         self.resent_episodes = self.refused_episodes = 0
         self._counted = (time.monotonic(), 0)
-        saved = statefile.take(path)
-        if saved is not None:
+        if (saved := statefile.take(path)) is not None:
             self._restore(saved)
 
     def offer(self, observation: Observation) -> None:
         """Take an observation from the inbox: new, repeated, outdated, or of a rival."""
-        if not self._serves(observation):
+        served = self._served
+        if not served.takes(observation, time.monotonic()):
             self.rival_observations += 1
-            told = f"{self._robot}: life {observation.life} is not served, {self._life} is"
+            told = f"{self._robot}: life {observation.life} is not served, {served.life} is"
             self._complaints.tell("rival", told)
             return
         place, answered = self._place(observation), self._answered
         if answered and answered[0][0] == place[0] and place < answered[0]:
             self.stale_observations += 1
-            if self._heard_s - self._on_s < RIVAL_SILENT_S:
+            if served.heard_s - self._on_s < RIVAL_SILENT_S:
                 return
             self._complaints.tell("back", f"{self._robot} is not at {answered[0]}, but at {place}")
-        self._on_s = self._heard_s
+        self._on_s = served.heard_s
         if answered and answered[0] == place:
             self._publish(answered[1])  # our answer was lost
             return
@@ -121,27 +100,10 @@ class Session:
             if self.actor.progress is not None:
                 self._finish(observation)
 
-    def _serves(self, observation: Observation) -> bool:
-        """Whether this life is the one to serve: one at a time, and none is silenced for good.
-
-        Another life takes over if only it has the driver's role, if the one before has been silent
-        for `RIVAL_SILENT_S`, or if it continues that one, which has not the role alone.
-        """
-        now_s, life = time.monotonic(), observation.life
-        if life != self._life:
-            new, old = (each in self._lives() for each in (life, self._life))
-            silent = now_s - self._heard_s > RIVAL_SILENT_S
-            continues = self._life in observation.earlier and (new or not old)
-            if self._life and not (continues or (new and not old) or silent):
-                return False
-            self._life = life
-        self._heard_s = now_s
-        return True
-
     @property
     def silent(self) -> bool:
         """Whether nothing was heard of the robot for a while."""
-        return time.monotonic() - self._heard_s > RIVAL_SILENT_S
+        return self._served.silent(time.monotonic())
 
     def advance(self) -> Observation | None:
         """Do what can be done now: hand over, wait for training. Raises Stopped and StateError.

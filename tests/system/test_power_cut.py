@@ -21,7 +21,8 @@ from builders import FakePredictor, image_with, make_config
 from fakes import message
 
 from services.actor.courier import Delivery
-from services.actor.session import Newest, Session
+from services.actor.heard import Newest
+from services.actor.session import Session
 from services.learner.history import Place
 from services.replay.numbering import progress_of
 from services.replay.storage import Refused, Storage

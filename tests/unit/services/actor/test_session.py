@@ -13,7 +13,8 @@ import pytest
 from builders import FakePredictor, make_config, make_observation
 
 from services.actor.courier import Delivery
-from services.actor.session import Newest, Session
+from services.actor.heard import Newest
+from services.actor.session import Session
 from shared.messages import Action, Episode, EpisodeAck, LearnerState, RobotProgress, image_array
 
 LEARNER = LearnerState(
