@@ -164,13 +164,13 @@ class Service:
             rivals=self.rivals,
         )
 
-    def insist(self, what: str, attempt: Callable[[], T], *, refusable: bool = False) -> T:
+    def insist(self, what: str, attempt: Callable[[], T], *, refusals: int = 0) -> T:
         """Repeat a request until it is answered; log when it takes long.
 
-        refusable: it may be refused for good, and is then not repeated. Other requests are always
-        right, so a refusal of one is a mistake or a lie, and somebody will answer it.
+        refusals: how many refusals for good end it, since one may be a message gone astray or a
+            lie; 0: none does, for a request that is always right.
 
-        Raises Stopped, and PeerRefused if it is `refusable`.
+        Raises Stopped, and PeerRefused after so many refusals.
         """
         start_s, next_report_s = time.monotonic(), 5.0
         while True:
@@ -179,8 +179,10 @@ class Service:
             try:
                 return attempt()
             except (BusError, BadMessage) as error:
-                if refusable and isinstance(error, PeerRefused) and error.final:
-                    raise
+                if isinstance(error, PeerRefused) and error.final:
+                    refusals -= 1
+                    if refusals == 0:
+                        raise
                 waited_s = time.monotonic() - start_s
                 if waited_s > next_report_s:
                     self.log.warning("still waiting to %s after %.0f s: %s", what, waited_s, error)

@@ -12,6 +12,8 @@ from shared.service import Service
 
 AT_ONCE = 4
 """Episodes on their way at the same time; each robot has one at most, the others' wait."""
+REFUSALS = 3
+"""So often a request must be refused for good until it is given up."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ class Courier:
                 PROGRESS, ProgressRequest(robot=robot), RobotProgress, ident=robot
             )
 
-        return self._me.insist("ask replay for the robot's progress", attempt, refusable=True)
+        return self._me.insist("ask replay for the robot's progress", attempt, refusals=REFUSALS)
 
     def _deliver(self, episode: Episode) -> Delivery:
         attempts = 0
@@ -62,5 +64,5 @@ class Courier:
             return self._me.bus.request(EPISODE, episode, EpisodeAck, ident=episode.robot)
 
         return Delivery(
-            self._me.insist("hand an episode to replay", attempt, refusable=True), attempts
+            self._me.insist("hand an episode to replay", attempt, refusals=REFUSALS), attempts
         )

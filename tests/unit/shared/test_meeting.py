@@ -9,7 +9,7 @@ from typing import Any, get_args
 import pytest
 
 from shared.config import DRIVER_ONLY, BusConfig, Config, Section
-from shared.errors import ConfigError
+from shared.errors import ConfigError, PeerRefused
 from shared.keys import Peer
 from shared.messages import PROTOCOL_VERSION
 from shared.service import Service, StopFlag
@@ -79,3 +79,24 @@ def changed(section: Section, path: list[str]) -> Any:
     else:
         other = f"{value}x" if isinstance(value, str) else type(value)(not value)
     return section.model_copy(update={name: other})
+
+
+@pytest.mark.parametrize(("refusals", "attempts"), [(0, 6), (3, 3)])
+def test_a_request_is_repeated_until_it_was_refused_for_good_so_often(
+    refusals: int, attempts: int
+) -> None:
+    bus: Any = SimpleNamespace(inbox=lambda: None)
+    me, tried = Service("actor", "main", LIFE, Config(), bus, StopFlag()), []
+
+    def attempt() -> str:
+        tried.append(1)
+        if len(tried) < 6:
+            raise PeerRefused("no", final=True)
+        return "done"
+
+    if refusals:
+        with pytest.raises(PeerRefused):
+            me.insist("ask", attempt, refusals=refusals)
+    else:
+        assert me.insist("ask", attempt) == "done"
+    assert len(tried) == attempts
