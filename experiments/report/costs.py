@@ -41,6 +41,7 @@ def gradient_steps(plan: Plan) -> int:
         counts_actions = plan.counted_in == "actions"
         every = learning.fit_every_actions if counts_actions else learning.fit_every
         fits = stage.until // every - start // every if every else 0
+        fits += learning.fit_after_fill and start == 0 and every != 1
         batches = learning.fit_epochs * -(-config.memory.capacity // learning.batch_size)
         total += fits * batches
         episodes = stage.until - start

@@ -110,8 +110,9 @@ class Site:
         targets = SimpleNamespace(none=FakePredictor(version=0), of=lambda *_: predictor)
         weights = SimpleNamespace(newest=(1, b""), refused=0, wait_for=lambda _: (1, b""))
         courier = SimpleNamespace(send=self._send, ask=lambda robot: done(self._progress(robot)))
-        given: tuple[Any, ...] = (me, "robot1", self.actor_file, Newest(LEARNER), weights, targets)
-        self.session = Session(*given, courier, set)  # type: ignore[arg-type]
+        place: tuple[Any, ...] = (me, "robot1", new_life(), self.actor_file)
+        given: tuple[Any, ...] = (Newest(LEARNER), weights, targets, courier, set)
+        self.session = Session(*place, *given)
 
     def _progress(self, robot: str) -> Any:
         return progress_of(self.storage.counters(), CONFIG.memory, robot)

@@ -25,7 +25,8 @@ def counted_one_by_one(plan: Plan) -> int:
     for index, stage in enumerate(plan.stages):
         config = stage_config(plan, index, seed=1)
         while episode <= stage.until:
-            if config.learning.fit_every and episode % config.learning.fit_every == 0:
+            due = config.learning.fit_every and episode % config.learning.fit_every == 0
+            if due or (config.learning.fit_after_fill and episode == 1):
                 batches = math.ceil(config.memory.capacity / config.learning.batch_size)
                 steps += config.learning.fit_epochs * batches
             else:
