@@ -32,7 +32,7 @@ MUCH_CIRCLING = 0.2
 COLLAPSE = 0.25
 """A mean fitness below this part of the median of its curve is called a collapse."""
 ENOUGH_SEEDS = 8
-"""With fewer seeds of either experiment, bootstrap intervals are far too narrow."""
+"""Bootstrap intervals are far too narrow if either experiment has fewer seeds."""
 
 
 def _verdict(same: bool) -> str:

@@ -35,12 +35,12 @@ class _Heard:
 
     restarts: int
     life: str = ""
-    """Of the process before: what still comes of it does not count."""
+    """The life of the process before; what still comes of it does not count."""
     sign: object = None
     appeared: bool = False
     silent_s: float = 0.0
     progress: tuple[int, float] = (0, 1.0)
-    """Of a pass of replay: after which change, and how far."""
+    """How far replay has come in a pass over its memory, and after which change."""
     still_s: float = 0.0
     given_up: bool = False
 

@@ -23,7 +23,7 @@ class Mirror:
         self.samples = SampleStore()
         self.number: int | None = None
         self.lineage = NO_LINEAGE
-        """Of the memory that this is the mirror of, as of `number`."""
+        """Lineage of the mirrored memory as of `number`."""
         self.resyncs = 0
 
     def reach(self, bus: Bus, number: int, lineage: str) -> None:
