@@ -62,6 +62,7 @@ def cluster(tmp_path: Path, run_name: str) -> Iterator[Cluster]:
 
 
 def command(cluster: Cluster, name: str, lines: list[str] | None = None) -> bool:
+    """Give an order to all robots that are there now, and return whether all have followed it."""
     echo = (lines if lines is not None else []).append
     return order(cluster.bus, name, "", echo)  # type: ignore[arg-type]
 
@@ -107,6 +108,7 @@ def test_a_driver_that_was_away_learns_of_a_stop_from_the_services(
         watch.stands()
         cluster.kill("router")
         cluster.start("router")
+        cluster.wait(lambda: len(cluster.bus.peers("driver")) == 1, 60, "the driver is back")
         cluster.wait(lambda: command(cluster, "clear"), 60, "released")
         watch.moves()
 

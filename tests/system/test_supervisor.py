@@ -12,8 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from terminals import full_pipe
 
+from benchmarks.terminals import full_pipe
 from benchmarks.waiting import wait_until
 from services.launcher.supervisor import ChildSpec, ChildStatus, Ending, Supervisor
 from services.monitor.running import locked

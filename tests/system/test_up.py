@@ -13,8 +13,8 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from terminals import Terminal
 
+from benchmarks.terminals import Terminal
 from benchmarks.waiting import wait_until
 from experiments.report.run_folder import read_run
 

@@ -6,8 +6,8 @@ import os
 import sys
 
 import pytest
-from terminals import Terminal
 
+from benchmarks.terminals import Terminal
 from benchmarks.waiting import wait_until
 from services.launcher.keys import Keys
 

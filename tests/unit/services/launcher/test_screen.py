@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 
-from terminals import full_pipe
+from benchmarks.terminals import full_pipe
 
 CODE = """
 from services.launcher.live import RunView
