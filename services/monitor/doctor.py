@@ -95,7 +95,7 @@ def run(config: Config, folder: Path) -> int:
     findings = list(examine(config, folder))
     for finding in findings:
         table.add_row(finding.verdict, finding.what, finding.found, finding.advice)
-    console = Console(highlight=False)
+    console = Console(markup=False, emoji=False, highlight=False)
     console.print(table)
     bad = [finding for finding in findings if finding.verdict == "bad"]
     console.print("ready" if not bad else "not ready: " + "; ".join(f.advice for f in bad))
