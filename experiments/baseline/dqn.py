@@ -28,7 +28,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -49,31 +49,11 @@ from shared.statefile import write_atomically
 NAMES = {"progress": "dqn-progress", "distance": "dqn-distance"}
 """Name of the experiment, by its reward."""
 STAGE = "learn"
-REWARDS = tuple(NAMES)
 TARGET_EVERY = 1000
 """Actions between copies of the target network."""
 EVALUATIONS = 10
 """In a run, at equal intervals."""
 EXIT_USAGE = 2
-
-
-class Learner(Protocol):
-    """What learns in the environment it was made with."""
-
-    def drive(self, actions: int) -> None:
-        """Drive this many more actions, with the training that falls due."""
-
-    @property
-    def actions(self) -> int:
-        """Driven so far, the random ones before learning not included."""
-
-    @property
-    def train_steps(self) -> int:
-        """Mini-batches trained so far."""
-
-    @property
-    def greedy(self) -> Chooser:
-        """The frozen policy."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +103,7 @@ class DistanceReward(gymnasium.Wrapper[Image, np.int64, Image, np.int64]):
 
 
 class Dqn:
-    """DQN of Stable-Baselines3 as a learner."""
+    """DQN of Stable-Baselines3 as a learner; it has driven the random actions already."""
 
     def __init__(self, plan: BaselinePlan) -> None:
         from experiments.baseline import sb3
@@ -138,7 +118,8 @@ class Dqn:
             TimeLimit(env, config.episode.max_samples), config,
             random_steps=self._random, target_update_interval=TARGET_EVERY,
         )  # fmt: skip
-        self.greedy = sb3.greedy(self._model)
+        self.greedy: Chooser = sb3.greedy(self._model)
+        """The frozen policy."""
         self.drive(self._random)
 
     def drive(self, actions: int) -> None:
@@ -156,7 +137,7 @@ class Dqn:
         return self._sb3.mini_batches(self._model)
 
 
-def run(plan: BaselinePlan, learner: Learner) -> None:
+def run(plan: BaselinePlan, learner: Dqn) -> None:
     """Learn, evaluate at intervals; leaves `evaluations.csv` and `run.json` as our experiments do.
 
     `seconds` is the wall time of learning alone.
@@ -183,21 +164,13 @@ def run(plan: BaselinePlan, learner: Learner) -> None:
         }
         append_csv(table, EVALUATION_COLUMNS, [row])
     looker.close()
-    write_atomically(plan.out / "run.json", _told(plan, learner, seconds, began))
+    write_atomically(plan.out / "run.json", _told(plan, learner, round(seconds, 1), began))
 
 
-def _told(plan: BaselinePlan, learner: Learner, seconds: float, began: str) -> bytes:
+def _told(plan: BaselinePlan, learner: Dqn, seconds: float, began: str) -> bytes:
     """What was run, with the names that reports of experiments read."""
-    counts = {"actions": learner.actions, "train_steps": learner.train_steps}
-    took_s = round(seconds, 1)
-    stage = StageInfo(
-        name=STAGE,
-        world=plan.config.robot.world,
-        first_episode=0,
-        last_episode=0,
-        seconds=took_s,
-        **counts,
-    )
+    done = {"actions": learner.actions, "train_steps": learner.train_steps}
+    stage = {"name": STAGE, "world": plan.config.robot.world, "first_episode": 0, "last_episode": 0}
     return RunInfo(
         experiment=NAMES[plan.reward],
         title=f"DQN of Stable-Baselines3, reward {plan.reward}",
@@ -209,9 +182,9 @@ def _told(plan: BaselinePlan, learner: Learner, seconds: float, began: str) -> b
         started=began,
         finished=now_utc(),
         complete=True,
-        seconds=took_s,
-        stages=(stage,),
-        **counts,
+        seconds=seconds,
+        stages=(StageInfo.model_validate({**stage, **done}),),
+        **done,
     ).to_json()
 
 
@@ -241,7 +214,7 @@ def planned(words: Sequence[str]) -> BaselinePlan:
     parser.add_argument("--scale", choices=SCALES, default="tenth", help="of the plan")
     parser.add_argument("--actions", type=_positive, default=50_000, help="after the random ones")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--reward", choices=REWARDS, default=REWARDS[0])
+    parser.add_argument("--reward", choices=NAMES, default="progress")
     parser.add_argument("--starts", type=_positive, default=16, help="drives of an evaluation")
     parser.add_argument("--drive-actions", type=_positive, default=400, help="of each drive")
     parser.add_argument("--threads", type=_positive, default=1)
