@@ -14,9 +14,8 @@ from pydantic import ValidationError
 
 from services.processes import DRIVER, SERVICES
 from shared.bus import Bus
-from shared.codec import first_problem
 from shared.config import Config
-from shared.errors import BadMessage, BusError, ConfigError, PeerMissing
+from shared.errors import BadMessage, BusError, ConfigError, PeerMissing, first_problem
 from shared.facts import NAME
 from shared.halts.book import ALL
 from shared.halts.orders import RobotOrder, order

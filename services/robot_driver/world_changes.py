@@ -22,8 +22,8 @@ from services.robot_driver.simulated.world import (
     WorldError,
     load_world,
 )
-from shared.codec import decode, encode, first_problem
-from shared.errors import BadMessage
+from shared.codec import decode, encode
+from shared.errors import BadMessage, first_problem
 from shared.messages import Box, WorldChange, WorldChanged
 
 MAX_PENDING = 64

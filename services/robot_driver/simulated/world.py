@@ -36,7 +36,7 @@ from services.robot_driver.simulated.world_parts import (
     Texture,
     Wall,
 )
-from shared.errors import ConfigError
+from shared.errors import ConfigError, first_problem
 
 __all__ = [
     "MAX_OBSTACLES",
@@ -310,14 +310,7 @@ def read_world(path: Path) -> World:
     try:
         world = World.model_validate(tree)
     except ValidationError as error:
-        raise WorldError(f"{path.name}: {_first_line(error)}") from error
+        raise WorldError(f"{path.name}: {first_problem(error)}") from error
     if world.name != path.stem:
         raise WorldError(f"{path.name}: name: {world.name!r} does not match the file name")
     return world
-
-
-def _first_line(error: ValidationError) -> str:
-    first = error.errors(include_url=False, include_context=False)[0]
-    key = ".".join(str(part) for part in first["loc"])
-    text = first["msg"].removeprefix("Value error, ")
-    return f"{key}: {text}" if key else text
