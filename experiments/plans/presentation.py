@@ -91,7 +91,7 @@ class Presentation(Section):
     the same corridors."""
     reference_of: Names = ()
     """Groups in which all others are compared with this experiment only."""
-    table: Literal["", "fitness", "first-lap"] = ""
+    table: Literal["", "fitness"] = ""
     """The table that this experiment has a row in."""
     full_scale: bool = True
     """Whether the plan is meant for the full scale, and its cost there is told."""

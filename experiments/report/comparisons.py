@@ -47,9 +47,6 @@ def _tables(company: Company) -> list[Block]:
         figures = (company.shown[e.name].figures.get("table") for e in fitness)
         blocks.append(tables.fitness(fitness, scale, next(filter(None, figures), "")))
         blocks += sentences(findings.same_start(fitness))
-    variants = [e for e in members.values() if company.shown[e.name].table == "first-lap"]
-    if len(variants) > 1:
-        blocks.append(tables.first_laps(company.references_first(variants), scale))
     memories = tables.memories(list(members.values()), scale)
     return [*blocks, memories] if len(memories.rows) > 1 else blocks
 
@@ -64,7 +61,7 @@ def _frozen(company: Company) -> list[Block]:
     blocks: list[Block] = []
     for (group, *worlds), members in groups.items():
         if len(members) > 1:
-            members = company.references_first(members, group)
+            members.sort(key=lambda e: group not in company.shown[e.name].reference_of)
             name = "-".join((group, *worlds))
             first_only = group in company.shown[members[0].name].reference_of
             blocks += _curves(company, name, members)

@@ -26,17 +26,6 @@ class Company:
     shown: Mapping[str, Presentation]
     scale: str
 
-    def references_first(
-        self, members: Sequence[Experiment], group: str | None = None
-    ) -> list[Experiment]:
-        """The same experiments, first those that others (of a group) are compared with."""
-
-        def later(experiment: Experiment) -> bool:
-            references = self.shown[experiment.name].reference_of
-            return group not in references if group else not references
-
-        return sorted(members, key=later)
-
 
 def named_comparison(company: Company, ours: Experiment, named: Comparison) -> list[Block]:
     """Figure, table and sentences of a comparison, or why it is left out."""

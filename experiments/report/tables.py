@@ -85,29 +85,6 @@ def fitness(experiments: Sequence[Experiment], scale: str, figure: str) -> Table
     })  # fmt: skip
 
 
-def first_laps(experiments: Sequence[Experiment], scale: str) -> Table:
-    """How soon each seed of each variant drove a lap frozen, and how well all drove in the end."""
-
-    def laps(e: Experiment) -> list[dict[str, float]]:
-        return [run.info.first_lap for run in e.runs if run.info.first_lap]
-
-    def soonest(name: str) -> Told:
-        return lambda e: spread(np.array([lap[name] for lap in laps(e)]))
-
-    title = f"Variants of {experiments[0].first.title}"
-    return table(f"{scale}-first-laps", title, experiments, {
-        "variant": lambda e: e.first.title,
-        "plan": lambda e: f"`{e.name}`",
-        "seeds": lambda e: ", ".join(str(run.info.seed) for run in e.runs),
-        "drove a lap": lambda e: f"{len(laps(e))} of {len(e.runs)}",
-        "first lap after actions": soonest("actions"),
-        "after s": soonest("seconds"),
-        "bumps per 1,000": _in_first_world("bumps_per_1000"),
-        "distance": _in_first_world("distance"),
-        "s in all": lambda e: spread(np.array([run.info.seconds for run in e.runs])),
-    })  # fmt: skip
-
-
 def memories(experiments: Sequence[Experiment], scale: str) -> Table:
     """What memories held in the end, and how many actions were taken for each of their places."""
 
