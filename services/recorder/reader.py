@@ -119,7 +119,7 @@ class Recording:
             file.seek(-4, 1)
             told, again = file.read(4), RecordBuilder()
             attachment.write(again)  # type: ignore[no-untyped-call]
-            if told not in (bytes(4), again.end()[-4:]):  # type: ignore[no-untyped-call]
+            if told not in (bytes(4), again.end()[-4:]):
                 raise McapError(f"weights {version} do not match their checksum")
             return attachment.data
 
