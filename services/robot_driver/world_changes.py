@@ -15,13 +15,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from services.robot_driver.robot import ChangeableWorld
-from services.robot_driver.simulated.world import (
-    MAX_OBSTACLES,
-    Obstacle,
-    World,
-    WorldError,
-    load_world,
-)
+from services.robot_driver.simulated.world import MAX_OBSTACLES, World, WorldError, load_world
+from services.robot_driver.simulated.world_parts import Obstacle
 from shared.codec import decode, encode
 from shared.errors import BadMessage, first_problem
 from shared.messages import Box, WorldChange, WorldChanged

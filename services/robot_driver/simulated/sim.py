@@ -31,14 +31,8 @@ from services.robot_driver.robot import (
 from services.robot_driver.simulated.kinematics import advance, wrap
 from services.robot_driver.simulated.lap_counter import LapCounter
 from services.robot_driver.simulated.scene import Scene
-from services.robot_driver.simulated.world import (
-    MAX_OBSTACLES,
-    Obstacle,
-    Start,
-    World,
-    WorldError,
-    load_world,
-)
+from services.robot_driver.simulated.world import MAX_OBSTACLES, World, WorldError, load_world
+from services.robot_driver.simulated.world_parts import Obstacle, Start
 from shared.config import RobotConfig
 from shared.rl.preprocess import preprocess
 

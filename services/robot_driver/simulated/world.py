@@ -19,46 +19,21 @@ import numpy.typing as npt
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from services.robot_driver.simulated.world_parts import (
-    Colour,
-    DoorStyle,
     Fixture,
     Floats,
     Lap,
     Length,
-    Material,
     Obstacle,
     Part,
-    Place,
     Route,
     Start,
     Surface,
     Text,
     Texture,
     Wall,
+    inside,
 )
 from shared.errors import ConfigError, first_problem
-
-__all__ = [
-    "MAX_OBSTACLES",
-    "WORLDS",
-    "Colour",
-    "DoorStyle",
-    "Fixture",
-    "Floats",
-    "Lap",
-    "Material",
-    "Obstacle",
-    "Place",
-    "Route",
-    "Start",
-    "Surface",
-    "Texture",
-    "Wall",
-    "World",
-    "WorldError",
-    "load_world",
-    "read_world",
-]
 
 WORLDS = Path(__file__).parent / "worlds"
 """Folder of the worlds that come with the driver."""
@@ -212,12 +187,7 @@ class World(Part):
 
     def between_walls(self, points: Floats) -> npt.NDArray[np.bool_]:
         """Whether points float64 [n, 2] lie inside the boundary and off islands."""
-        x, y = points[:, 0, None], points[:, 1, None]
-        ax, ay, bx, by = self.segments.T[:, None, :]
-        spans = (ay > y) != (by > y)
-        rise = np.where(by == ay, 1.0, by - ay)
-        crosses = spans & (x < ax + (y - ay) / rise * (bx - ax))
-        return np.asarray(np.count_nonzero(crosses, axis=1) % 2 == 1)
+        return inside(self.segments, points)
 
     def free(self, points: Floats) -> npt.NDArray[np.bool_]:
         """Whether points float64 [n, 2] lie between the walls and in no obstacle."""
