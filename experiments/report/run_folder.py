@@ -6,12 +6,10 @@ seed; seeds of one experiment at one scale belong together.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,8 +18,9 @@ from pydantic import TypeAdapter, ValidationError
 from experiments.drives import routes
 from experiments.drives.routes import Route
 from experiments.records import EVALUATION_COLUMNS, TourRecord
-from shared.errors import ConfigError, StateError
-from shared.facts import ACTION_COUNT, IMAGE_SHAPE
+from experiments.runs import probes
+from experiments.runs.probes import Probes
+from shared.errors import ConfigError, StateError, first_problem
 from shared.run_record import RUN, SERVICES, RunInfo, read_csv, read_episodes, samples_by_world
 
 Floats = npt.NDArray[np.float64]
@@ -69,19 +68,6 @@ class Rows:
 
 
 @dataclass(frozen=True)
-class Probes:
-    """Images of a fixed set, and what one network predicts for them."""
-
-    label: str
-    """Stage and world, or `best` and world."""
-    world: str
-    images: npt.NDArray[np.uint8]
-    """uint8 [n, 50, 75]."""
-    values: Floats
-    """float64 [n, actions]: clipped rewards of all actions."""
-
-
-@dataclass(frozen=True)
 class RunFolder:
     """One seed of an experiment, as its folder holds it."""
 
@@ -89,7 +75,8 @@ class RunFolder:
     info: RunInfo
     episodes: Rows
     evaluations: Rows
-    probes: tuple[Probes, ...]
+    probes: dict[str, Probes]
+    """What networks predict, by stage and world, or `best` and world."""
     routes: dict[str, Route]
     """The route of each drive, by its label."""
     tours: tuple[TourRecord, ...]
@@ -239,11 +226,8 @@ def read_run(folder: Path) -> RunFolder:
         info,
         episodes,
         _rows(lambda: read_csv(folder / "evaluations.csv", EVALUATION_COLUMNS)),
-        tuple(_probes(path) for path in sorted(folder.glob("probes-*.npz"))),
-        {
-            path.stem.removeprefix("route-"): routes.read(path)
-            for path in sorted(folder.glob("route-*.npz"))
-        },
+        {_label(path): probes.read(path) for path in sorted(folder.glob("probes-*.npz"))},
+        {_label(path): routes.read(path) for path in sorted(folder.glob("route-*.npz"))},
         _tours(folder / "tours.json"),
     )
 
@@ -252,8 +236,15 @@ def read_info(path: Path) -> RunInfo:
     """Read and check `run.json`. Raises StateError."""
     try:
         return RunInfo.model_validate_json(path.read_bytes())
-    except (OSError, ValidationError) as error:
-        raise StateError(f"{path}: {_first_line(error)}") from error
+    except OSError as error:
+        raise StateError(f"{path}: {error}") from error
+    except ValidationError as error:
+        raise StateError(f"{path}: {first_problem(error)}") from error
+
+
+def _label(path: Path) -> str:
+    """What stands behind the kind in the name of a file."""
+    return path.stem.partition("-")[2]
 
 
 def _tours(path: Path) -> tuple[TourRecord, ...]:
@@ -261,15 +252,8 @@ def _tours(path: Path) -> tuple[TourRecord, ...]:
         return ()
     try:
         return _TOURS.validate_json(path.read_bytes())
-    except (OSError, ValidationError) as error:
-        raise StateError(f"{path}: {_first_line(error)}") from error
-
-
-def _first_line(error: Exception) -> str:
-    if isinstance(error, ValidationError):
-        first = error.errors()[0]
-        return f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}"
-    return str(error)
+    except ValidationError as error:
+        raise StateError(f"{path}: {first_problem(error)}") from error
 
 
 def _totals(episodes: Rows) -> dict[str, float]:
@@ -288,28 +272,3 @@ def _rows(read: Callable[[], list[dict[str, str]]]) -> Rows:
         return Rows(tuple(read()))
     except (ValueError, OSError) as error:
         raise StateError(str(error)) from error
-
-
-def _arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise StateError(f"{path}: {error}") from error
-
-
-def _probes(path: Path) -> Probes:
-    arrays = _arrays(path)
-    try:
-        images, values = arrays["images"], arrays["values"]
-        world = str(arrays["world"])
-    except KeyError as error:
-        raise StateError(f"{path}: expected an array {error}, found none") from error
-    if images.shape[1:] != IMAGE_SHAPE or images.dtype != np.uint8:
-        raise StateError(f"{path}: expected images uint8 [n, 50, 75], got {images.shape}")
-    if values.shape != (len(images), ACTION_COUNT):
-        raise StateError(
-            f"{path}: expected values [{len(images)}, {ACTION_COUNT}], got {values.shape}"
-        )
-    label = path.stem.removeprefix("probes-")
-    return Probes(label, world, images, values.astype(np.float64))

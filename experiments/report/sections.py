@@ -138,7 +138,7 @@ def _evaluations(experiment: Experiment, shown: Presentation) -> list[Block]:
 
 def _probes(experiment: Experiment, shown: Presentation) -> list[Block]:
     """What the best and the last weights predict, one figure per corridor."""
-    worlds = sorted({entry.world for run in experiment.runs for entry in run.probes})
+    worlds = sorted({entry.world for run in experiment.runs for entry in run.probes.values()})
     blocks: list[Block] = []
     for world in worlds:
         for weights, choose in (("best", probes.best), ("last", probes.last)):

@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from experiments.report.figures.style import ACTION_COLOURS, GREY, INK, sheet, styled
-from experiments.report.run_folder import Experiment, Floats, Probes
+from experiments.report.run_folder import Experiment, Floats
+from experiments.runs.probes import Probes
 from shared.facts import ACTION_COUNT, ACTIONS, SHORT_NAMES
 
 COLUMNS = 6
@@ -91,9 +92,8 @@ class Choice:
 def last(experiment: Experiment, world: str) -> Choice | None:
     """Predictions at the end of the newest stage, of the lowest seed that has them."""
     for run in experiment.runs:
-        labelled = {probes.label: probes for probes in run.probes}
         for stage in reversed(run.info.stages):
-            if found := labelled.get(f"{stage.name}-{world}"):
+            if found := run.probes.get(f"{stage.name}-{world}"):
                 return Choice(run.info.seed, f"weights at the end of stage {stage.name}", found)
     return None
 
@@ -101,9 +101,8 @@ def last(experiment: Experiment, world: str) -> Choice | None:
 def best(experiment: Experiment, world: str) -> Choice | None:
     """Predictions by the weights of the longest way without a bump, of the lowest seed."""
     for run in experiment.runs:
-        for probes in run.probes:
-            if probes.label == f"best-{world}":
-                return Choice(run.info.seed, "best weights", probes)
+        if found := run.probes.get(f"best-{world}"):
+            return Choice(run.info.seed, "best weights", found)
     return None
 
 

@@ -11,8 +11,9 @@ from matplotlib.text import Text
 from experiments.report.figures import drives, memory, probes, progress
 from experiments.report.figures.probes import chosen
 from experiments.report.figures.style import ACTION_COLOURS, PALETTE, colours, png, told_apart
-from experiments.report.run_folder import Experiment, Probes, load
+from experiments.report.run_folder import Experiment, load
 from experiments.report.statistics import block_means
+from experiments.runs.probes import Probes
 from shared.facts import SHORT_NAMES
 from tests.synthetic_runs import write_run
 
@@ -88,7 +89,7 @@ def test_bars_of_the_memory_are_the_newest_medians(found: dict[str, Experiment])
 def test_bars_stand_where_their_action_leads() -> None:
     values = np.array([[0.1, 0.2, 0.3], [-0.1, -0.2, -0.3]])
     images = np.zeros((2, 50, 75), np.uint8)
-    shown = Probes("best-plus", "plus", images, values)
+    shown = Probes("plus", images, values)
     figure = probes.predictions(shown, {"a": values, "b": -values}, 6)
     bars = [heights(axes) for axes in figure.axes if axes.patches]
     assert bars == [[0.2, 0.1, 0.3], [-0.2, -0.1, -0.3], [-0.2, -0.1, -0.3], [0.2, 0.1, 0.3]]
