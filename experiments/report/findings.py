@@ -6,31 +6,22 @@ What the thesis says, and whether it holds, stands in the table of claims (`clai
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 
 from experiments.drives.traces import Trace
-from experiments.report.figures.progress import curve_of
 from experiments.report.measures import (
-    MISSING,
     Kept,
     evaluated,
     longest_run,
-    loss_ratio,
     max_mean_fitness,
     number,
     of_seeds,
     spread,
 )
-from experiments.report.run_folder import Experiment, Floats, RunFolder
-from shared.facts import SHORT_NAMES
+from experiments.report.run_folder import Experiment
 
-BALANCED = 0.05
-"""Shares of the actions that differ by at most this are called balanced."""
 MUCH_CIRCLING = 0.2
-COLLAPSE = 0.25
-"""A mean fitness below this part of the median of its curve is called a collapse."""
 
 
 def completeness(experiment: Experiment) -> list[str]:
@@ -60,17 +51,6 @@ def fitness(experiment: Experiment) -> list[str]:
     ]
 
 
-def first_lap(experiment: Experiment) -> list[str]:
-    """When frozen networks first drove a whole lap, where that was looked at."""
-    laps = [run.info.first_lap for run in experiment.runs]
-    driven = [lap for lap in laps if lap]
-    if not driven:
-        return []
-    actions, seconds = (np.array([lap[name] for lap in driven]) for name in ("actions", "seconds"))
-    told = f"{len(driven)} of {len(laps)} seeds drove a first lap frozen, after {spread(actions)}"
-    return [f"{told} actions, {spread(seconds)} s of learning."]
-
-
 def same_start(experiments: Sequence[Experiment]) -> list[str]:
     """Whether seeds that several experiments share began with equal memories (A38, A46)."""
     if len(experiments) < 2:
@@ -84,44 +64,6 @@ def same_start(experiments: Sequence[Experiment]) -> list[str]:
     if differ:
         return [f"In seed {', '.join(differ)} the memories were not equal at the beginning."]
     return ["The memories of each seed were equal at the beginning."] if fills else []
-
-
-def loss(experiment: Experiment) -> list[str]:
-    """Loss after the first fitting phase over that before it; without one, at the end."""
-    found = of_seeds(experiment, loss_ratio)
-    if not len(found):
-        return []
-    fits = any(np.any(run.episodes.numbers("fitting") > 0) for run in experiment.runs)
-    when = "From before to after the first fitting phase" if fits else "From first to last"
-    return [f"{when}, the mean loss went to {spread(100.0 * found)} % of what it was."]
-
-
-def memory(experiment: Experiment) -> list[str]:
-    """Shares of the actions at the end, and whether they are balanced in most seeds."""
-    shares = {name: of_seeds(experiment, partial(_share, name)) for name in SHORT_NAMES}
-    if not len(shares[SHORT_NAMES[0]]):
-        return []
-    spans = np.ptp(np.stack(list(shares.values())), axis=0)
-    told = ", ".join(f"{name} {100 * np.median(each):.1f} %" for name, each in shares.items())
-    when = "At the end" if all(run.info.complete for run in experiment.runs) else "So far"
-    seeds = f"{np.count_nonzero(spans <= BALANCED)} of {len(spans)} seeds"
-    return [f"{when} the memory held {told} (medians). It was balanced in {seeds}."]
-
-
-def _share(action: str, run: RunFolder) -> float:
-    counts = {name: run.episodes.numbers(name)[-1:] for name in SHORT_NAMES}
-    total = sum(float(values.sum()) for values in counts.values())
-    return float(counts[action][0]) / total if total else MISSING
-
-
-def worlds_in_memory(experiment: Experiment) -> list[str]:
-    """Samples per corridor at the end."""
-    names = sorted({name for run in experiment.runs for name in run.samples_by_world})
-    last = {
-        name: np.array([run.samples_by_world.get(name, np.zeros(1))[-1] for run in experiment.runs])
-        for name in names
-    }
-    return [f"Samples at the end: {'; '.join(f'{n} {spread(v)}' for n, v in last.items())}."]
 
 
 def evaluation(experiment: Experiment, world: str) -> list[str]:
@@ -162,28 +104,6 @@ def highest_fitness(experiments: Sequence[Experiment]) -> str:
     """Highest mean fitness of each."""
     best = (f"{e.name} {spread(of_seeds(e, max_mean_fitness))}" for e in experiments)
     return f"Highest mean fitness: {'; '.join(best)}."
-
-
-def continued(before: Experiment, after: Experiment) -> list[str]:
-    """Whether the fitness rose where a run goes on from another, and whether it collapsed (A40)."""
-    old, new = _pooled(before), _pooled(after)
-    if not len(old) or not len(new):
-        return []
-    late, middle = float(np.mean(old[-max(1, len(old) // 4) :])), float(np.mean(new))
-    fell = float(new.min()) < COLLAPSE * float(np.median(new))
-    return [
-        f"The mean fitness went from {number(late)} (last quarter of {before.name}) to "
-        f"{number(middle)} ({after.name}), so it {'rose' if middle > late else 'did not rise'}.",
-        f"The curve {'collapsed at least once' if fell else 'never collapsed'}.",
-    ]
-
-
-def _pooled(experiment: Experiment) -> Floats:
-    """The fitness curve as the mean over seeds, as long as the shortest."""
-    curves = [curve_of(run, "fitness")[1] for run in experiment.runs]
-    length = min(len(curve) for curve in curves)
-    means: Floats = np.mean([curve[:length] for curve in curves], axis=0)
-    return means
 
 
 def kept_share(found: Sequence[Kept], world: str) -> str:

@@ -8,7 +8,7 @@ from functools import partial
 
 from experiments.plans.presentation import Comparison, Presentation
 from experiments.report import findings
-from experiments.report.document import Block, Findings, Missing, Picture, Table, sentences
+from experiments.report.document import Block, Findings, Missing, Picture, Table
 from experiments.report.figures import probes, progress
 from experiments.report.measures import kept, number
 from experiments.report.ratios import drives_at_equal_actions, ratio_blocks, ratios, stage_drives
@@ -56,8 +56,7 @@ def _continued(company: Company, ours: Experiment, named: Comparison) -> list[Bl
     before = company.experiments[earlier]
     caption = f"Mean fitness of the seeds. Red line: where {ours.name} begins."
     drawn = partial(progress.continued, before, ours)
-    picture = Picture(f"{ours.full_name}-continued", what, caption, drawn)
-    return [picture, *sentences(findings.continued(before, ours))]
+    return [Picture(f"{ours.full_name}-continued", what, caption, drawn)]
 
 
 def _fitness(company: Company, ours: Experiment, named: Comparison) -> list[Block]:

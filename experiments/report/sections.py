@@ -86,16 +86,14 @@ def _progress(experiment: Experiment, shown: Presentation) -> list[Block]:
     if window != run_folder.WINDOW:
         about += f" The thesis averages {run_folder.WINDOW} episodes."
     caption = f"{about} {_seeds_text(experiment)} {stages}"
-    told = [*findings.fitness(experiment), *findings.first_lap(experiment)]
-    blocks = [
+    blocks: list[Block] = [
         picture("fitness", "Fitness", caption, partial(progress.fitness, experiment)),
-        *sentences(told),
+        Findings(tuple(findings.fitness(experiment))),
     ]
     if not any(len(progress.curve_of(run, "loss")[0]) for run in experiment.runs):
         return [*blocks, Missing("loss over episodes", "nothing was trained")]
     caption = f"Loss, averaged over {window} episodes. {_seeds_text(experiment)} {stages}"
-    loss = picture("loss", "Loss", caption, partial(progress.loss, experiment))
-    return [*blocks, loss, *sentences(findings.loss(experiment))]
+    return [*blocks, picture("loss", "Loss", caption, partial(progress.loss, experiment))]
 
 
 def _memory(experiment: Experiment, shown: Presentation) -> list[Block]:
@@ -104,14 +102,12 @@ def _memory(experiment: Experiment, shown: Presentation) -> list[Block]:
     picture = partial(_picture, experiment, shown)
     caption = f"Samples in the replay memory by action. {_seeds_text(experiment)}"
     blocks: list[Block] = [
-        picture("memory", "Memory by action", caption, partial(memory.by_action, experiment)),
-        *sentences(findings.memory(experiment)),
+        picture("memory", "Memory by action", caption, partial(memory.by_action, experiment))
     ]
     if any(len(run.samples_by_world) > 1 for run in experiment.runs):
         caption = f"Samples in the replay memory by corridor. {_seeds_text(experiment)}"
         drawn = partial(memory.by_world, experiment)
         blocks.append(picture("worlds", "Memory by corridor", caption, drawn))
-        blocks += sentences(findings.worlds_in_memory(experiment))
     elif theirs := shown.figures.get("worlds"):
         blocks.append(Missing(f"memory by corridor ({theirs})", "samples of one corridor only"))
     return blocks
