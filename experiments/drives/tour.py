@@ -8,7 +8,7 @@ the robot.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -45,41 +45,17 @@ ROLE = "tour"
 BOX_NAME = "dropped-box"
 
 
-@dataclass(frozen=True)
-class Tour:
+class Tour(NamedTuple):
     """What happened on one test drive."""
 
     route: Route
-    driven: int
-    turned: int
-    """Turns on the spot, each of one action's duration."""
-    route_share: float
-    bridges: tuple[str, ...]
-    box_dropped: bool
+    told: TourRecord
 
-    @property
-    def bumps(self) -> int:
-        """Bumps of the whole drive."""
-        return int(self.route.trace.bumps.sum())
 
-    @property
-    def told(self) -> TourRecord:
-        """The figures, for a file."""
-        return TourRecord(
-            passed=self.passed,
-            driven=self.driven,
-            turned=self.turned,
-            bumps=self.bumps,
-            route_share=round(self.route_share, 4),
-            bridges=self.bridges,
-            box_dropped=self.box_dropped,
-        )
-
-    @property
-    def passed(self) -> bool:
-        """A full tour without a bump, past the box."""
-        full = self.driven >= DRIVEN and self.route_share >= ROUTE_SHARE
-        return full and len(self.bridges) >= BRIDGES and self.box_dropped and not self.bumps
+def passes(told: TourRecord) -> bool:
+    """A full tour without a bump, past the box."""
+    full = told.driven >= DRIVEN and told.route_share >= ROUTE_SHARE
+    return full and len(told.bridges) >= BRIDGES and told.box_dropped and not told.bumps
 
 
 class _TestDrive:
@@ -150,14 +126,17 @@ class _TestDrive:
         if dropped:
             self._env.robot.remove(BOX_NAME)
         world, trace = self._env.robot.world, self._drive.trace()
-        return Tour(
-            Route(trace, tuple(self._events)),
-            self.driven,
-            self.turned,
-            route_share(world, trace.places_m),
-            _bridges(world, trace.places_m),
-            dropped,
+        told = TourRecord(
+            passed=False,
+            driven=self.driven,
+            turned=self.turned,
+            bumps=sum(self._drive.bumps),
+            route_share=round(route_share(world, trace.places_m), 4),
+            bridges=_bridges(world, trace.places_m),
+            box_dropped=dropped,
         )
+        told = told.model_copy(update={"passed": passes(told)})
+        return Tour(Route(trace, tuple(self._events)), told)
 
     def _tell(self, text: str, action: int) -> None:
         self._events.append(Event(len(self._events) + 1, action, text))
