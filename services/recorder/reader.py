@@ -118,8 +118,8 @@ class Recording:
             assert isinstance(attachment, Attachment)
             file.seek(-4, 1)
             told, again = file.read(4), RecordBuilder()
-            attachment.write(again)  # type: ignore[no-untyped-call]
-            if told not in (bytes(4), again.end()[-4:]):
+            attachment.write(again)
+            if told not in (bytes(4), again.end()[-4:]):  # type: ignore[no-untyped-call]
                 raise McapError(f"weights {version} do not match their checksum")
             return attachment.data
 
