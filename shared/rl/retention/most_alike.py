@@ -14,6 +14,7 @@ import numpy.typing as npt
 import torch
 
 from shared.rl.retention.amounts import surplus
+from shared.rl.retention.columns import DESCRIBED, renew_descriptors
 from shared.rl.retention.strategy import Discard, Situation, Strategy
 from shared.rl.similarity import Descriptors
 
@@ -47,6 +48,20 @@ class MostAlike(Strategy):
         memory, changed = there.memory, self.renew(there)
         gone = older_of_most_alike(self.distances(there), len(memory), surplus(memory))
         return Discard(memory.capacity, memory.ids[gone], marked=changed)
+
+
+class Coverage(MostAlike):
+    """What stays covers the space of descriptors: two samples are alike if few bits differ."""
+
+    columns = DESCRIBED
+
+    def renew(self, there: Situation) -> bool:
+        """Describe what the weights in force have not described."""
+        return renew_descriptors(there)
+
+    def distances(self, there: Situation) -> Distances:
+        """Return what counts the bits that differ."""
+        return hamming(there.memory.rows["descriptor"])
 
 
 def older_of_most_alike(distances: Distances, n: int, count: int) -> Ranks:
@@ -94,3 +109,6 @@ def _nearest_newer(
     found[:, gone[start:]] = FAR
     nearest = found.shape[1] - 1 - np.argmin(found[:, ::-1], axis=1)
     return found[np.arange(len(ranks)), nearest], start + nearest
+
+
+COVERAGE = Coverage()

@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -19,39 +19,11 @@ from shared.rl.retention.table import STRATEGIES, TELLS
 if TYPE_CHECKING:
     from shared.config import MemoryConfig
     from shared.rl.engine import Progress
-    from shared.rl.memory import Ids, Images, ReplayMemory
+    from shared.rl.memory import Ids, ReplayMemory
+    from shared.rl.predictor import Predictor
 
 Rows = npt.NDArray[np.void]
 Floats = npt.NDArray[np.float64]
-
-
-class Network(Protocol):
-    """The target network as far as strategies use it. A `Predictor` is one."""
-
-    version: int
-
-    def descriptors(
-        self, images: Images, progress: Progress | None = None
-    ) -> npt.NDArray[np.uint8]:
-        """Return the packed 120-bit descriptors of images: uint8 [n, 15]."""
-
-    def unit_descriptors(
-        self, images: Images, progress: Progress | None = None
-    ) -> npt.NDArray[np.uint8]:
-        """Return such descriptors made of the units of FConn1: uint8 [n, 15]."""
-
-    def values(
-        self, images: Images, actions: npt.NDArray[np.uint8], progress: Progress | None = None
-    ) -> npt.NDArray[np.float32]:
-        """Return Q(s, a) of the action of each image, clipped: float32 [n]."""
-
-    def hidden(
-        self, images: Images, actions: npt.NDArray[np.uint8], progress: Progress | None = None
-    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-        """Return what FConn3 says, float32 [n, 128], and the unclipped Q(s, a), float32 [n]."""
-
-    def first(self, seed: int) -> Network:
-        """Return the network of version 1, as a run with this seed begins."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +34,8 @@ class Situation:
     number: int
     """Global episode number, 0 while the memory is filled."""
     config: MemoryConfig
-    network: Network
+    network: Predictor
+    """The target network."""
     seed: int
     """Seed of the run, for strategies that draw by chance."""
     progress: Progress | None = None
@@ -136,7 +109,8 @@ def lowest(values: Floats, count: int) -> npt.NDArray[np.int64]:
 
 def strategy(name: str) -> Strategy:
     """Return the strategy of this name. Raises KeyError for an unknown one."""
-    found: Strategy = import_module(f"{__package__}.{STRATEGIES[name].module}").STRATEGY
+    row = STRATEGIES[name]
+    found: Strategy = getattr(import_module(f"{__package__}.{row.module}"), row.name)
     return found
 
 
