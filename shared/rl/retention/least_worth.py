@@ -15,9 +15,18 @@ import numpy as np
 import numpy.typing as npt
 
 from shared.rl.draws import uniform
-from shared.rl.retention.amounts import kept_in_total, surplus, surplus_by_action
 from shared.rl.retention.columns import PREDICTED, errors, renew_predictions
-from shared.rl.retention.strategy import Discard, Floats, Situation, Strategy, chances, lowest
+from shared.rl.retention.strategy import (
+    Discard,
+    Floats,
+    Situation,
+    Strategy,
+    chances,
+    kept_in_total,
+    lowest,
+    surplus,
+    surplus_by_action,
+)
 
 if TYPE_CHECKING:
     from shared.rl.memory import ReplayMemory

@@ -12,9 +12,15 @@ import numpy as np
 
 from shared.facts import ACTION_COUNT, SHORT_NAMES
 from shared.rl.descriptor import BITS, threshold_bits
-from shared.rl.retention.amounts import kept_in_total, surplus_by_action
 from shared.rl.retention.columns import DESCRIBED, renew_descriptors
-from shared.rl.retention.strategy import Discard, Rows, Situation, Strategy
+from shared.rl.retention.strategy import (
+    Discard,
+    Rows,
+    Situation,
+    Strategy,
+    kept_in_total,
+    surplus_by_action,
+)
 from shared.rl.similarity import Descriptors, Mask, similar_to_newer
 
 if TYPE_CHECKING:

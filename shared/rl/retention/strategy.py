@@ -1,4 +1,7 @@
-"""The interface of a strategy of retention, and the discard that every strategy takes part in."""
+"""The interface of a strategy of retention, and the discard that every strategy takes part in.
+
+What stays is 99 % of the capacity, or of each action's share of it (A27, A33, E22).
+"""
 
 # ruff: noqa: ARG002  (defaults of an interface)
 
@@ -13,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from shared.facts import ACTION_COUNT
 from shared.rl.draws import uniform
 from shared.rl.retention.table import STRATEGIES, TELLS
 
@@ -143,3 +147,29 @@ def discard(there: Situation) -> Discard:
     memory.kept |= done.keep
     told = {**{name: memory.kept.get(name, 0) for name in TELLS}, **done.told}
     return replace(done, marked=done.marked or prepared, told=told)
+
+
+def kept_in_total(capacity: int) -> int:
+    """Return the samples kept in total: floor(0.99 N)."""
+    return 99 * capacity // 100
+
+
+def kept_of_action(capacity: int) -> int:
+    """Return the samples kept of an action above its share: floor(0.99 N / 3)."""
+    return 99 * capacity // (100 * ACTION_COUNT)
+
+
+def surplus(memory: ReplayMemory) -> int:
+    """Return how many samples must go, whichever they are."""
+    return max(0, len(memory) - kept_in_total(memory.capacity))
+
+
+def surplus_by_action(memory: ReplayMemory, capacity: int) -> dict[int, int]:
+    """Return how many samples each action above its share of this capacity must lose."""
+    if len(memory) <= capacity:
+        return {}
+    return {
+        action: count - kept_of_action(capacity)
+        for action, count in enumerate(memory.by_action())
+        if ACTION_COUNT * count > capacity
+    }

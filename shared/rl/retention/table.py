@@ -34,10 +34,10 @@ STRATEGIES = {
     "half": Row("least_worth", "HALF"),
     "worlds": Row("least_worth", "WORLDS"),
     "coverage": Row("most_alike", "COVERAGE", describes=True),
-    "coverage-pose": Row("coverage_pose"),
+    "coverage-pose": Row("most_alike", "COVERAGE_POSE"),
     "surprise": Row("least_worth", "SURPRISE"),
     "loss-reservoir": Row("least_worth", "LOSS_RESERVOIR"),
-    "gradients": Row("gradients"),
+    "gradients": Row("most_alike", "GRADIENTS"),
     "novelty": Row("rmm", "NOVELTY", tells=SEARCH, describes=True),
     "rmm-total": Row("rmm", "RMM_TOTAL", tells=SEARCH, describes=True),
 }
