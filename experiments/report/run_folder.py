@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +25,7 @@ from shared.errors import ConfigError, StateError, first_problem
 from shared.run_record import RUN, SERVICES, RunInfo, read_csv, read_episodes, samples_by_world
 
 Floats = npt.NDArray[np.float64]
+T = TypeVar("T")
 
 LEAST_WINDOW = 10
 """Episodes that a point of a curve averages at the smallest scale."""
@@ -219,6 +221,7 @@ def _seed_folders(folders: Iterable[Path]) -> list[Path]:
 def read_run(folder: Path) -> RunFolder:
     """Read one seed. Raises StateError naming the file that is not what it should be."""
     info, episodes = read_info(folder / RUN), _rows(lambda: read_episodes(folder))
+    tours = folder / "tours.json"
     if info.scale == SERVICES:
         info = info.model_copy(update=_totals(episodes))
     return RunFolder(
@@ -228,14 +231,19 @@ def read_run(folder: Path) -> RunFolder:
         _rows(lambda: read_csv(folder / "evaluations.csv", EVALUATION_COLUMNS)),
         {_label(path): probes.read(path) for path in sorted(folder.glob("probes-*.npz"))},
         {_label(path): routes.read(path) for path in sorted(folder.glob("route-*.npz"))},
-        _tours(folder / "tours.json"),
+        _checked(tours, _TOURS.validate_json) if tours.exists() else (),
     )
 
 
 def read_info(path: Path) -> RunInfo:
     """Read and check `run.json`. Raises StateError."""
+    return _checked(path, RunInfo.model_validate_json)
+
+
+def _checked(path: Path, check: Callable[[bytes], T]) -> T:
+    """What a file holds. Raises StateError."""
     try:
-        return RunInfo.model_validate_json(path.read_bytes())
+        return check(path.read_bytes())
     except OSError as error:
         raise StateError(f"{path}: {error}") from error
     except ValidationError as error:
@@ -245,15 +253,6 @@ def read_info(path: Path) -> RunInfo:
 def _label(path: Path) -> str:
     """What stands behind the kind in the name of a file."""
     return path.stem.partition("-")[2]
-
-
-def _tours(path: Path) -> tuple[TourRecord, ...]:
-    if not path.exists():
-        return ()
-    try:
-        return _TOURS.validate_json(path.read_bytes())
-    except ValidationError as error:
-        raise StateError(f"{path}: {first_problem(error)}") from error
 
 
 def _totals(episodes: Rows) -> dict[str, float]:

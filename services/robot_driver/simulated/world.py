@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import tomllib
+from collections.abc import Collection
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Self
@@ -142,6 +143,22 @@ class World(Part):
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"route.places: two are named {twice[0]!r}")
+
+    def check_placing(self, obstacle: Obstacle, there: Collection[str]) -> None:
+        """Whether a box can be placed beside those of these names. Raises ValueError."""
+        if obstacle.name in there:
+            raise ValueError(f"there is already an obstacle {obstacle.name!r}")
+        if len(there) >= MAX_OBSTACLES:
+            raise ValueError(f"there are {MAX_OBSTACLES} obstacles already")
+        self.check_obstacle(obstacle)
+
+    def check_start(self, start: int) -> None:
+        """Whether there is a start pose of this number. Raises ValueError."""
+        if not 0 <= start < len(self.starts):
+            raise ValueError(
+                f"world {self.name!r}: expected a start from 0 to {len(self.starts) - 1}, "
+                f"got {start}"
+            )
 
     def check_obstacle(self, obstacle: Obstacle) -> None:
         """Whether a box can stand in this world; it may touch or reach into walls.
