@@ -11,9 +11,10 @@ import os
 import queue
 import signal
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
+from multiprocessing.context import SpawnContext
 from pathlib import Path
 from typing import Any
 
@@ -84,10 +85,8 @@ def run_experiment(
     pieces = _pieces(names, scale, seeds, out)
     context = multiprocessing.get_context("spawn")
     reports: Any = context.Queue()
-    shares: Any = context.Queue()
-    for cores in shares_of(sorted(os.sched_getaffinity(0)), jobs):
-        shares.put(cores)
     stop: Any = context.Event()
+    shares = _queue_of(context, shares_of(sorted(os.sched_getaffinity(0)), jobs))
     for number in STOPS:  # also where the shell had SIGINT ignored, as it does in the background
         signal.signal(number, signal.default_int_handler)
     with (
@@ -106,6 +105,14 @@ def run_experiment(
 def shares_of(cores: Sequence[int], jobs: int) -> list[set[int]]:
     """Cores of each of the runs side by side: different ones as far as there are enough."""
     return [set(cores[job % len(cores) :: jobs]) for job in range(jobs)]
+
+
+def _queue_of(context: SpawnContext, items: Iterable[object]) -> Any:
+    """A queue to other processes that holds these items."""
+    made: Any = context.Queue()
+    for item in items:
+        made.put(item)
+    return made
 
 
 def _pieces(
