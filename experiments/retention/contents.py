@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.retention.refresh import Way, refresh
+from experiments.retention.refresh import Refresher
 from experiments.retention.stream import Stream
 from shared.config import Config, Numerics
 from shared.facts import SHORT_NAMES
@@ -50,7 +50,7 @@ def managed(
     config: Config,
     numerics: Numerics,
     ends: Mapping[int, str],
-    way: Way,
+    refresher: Refresher,
     refresh_every: int,
 ) -> Iterator[Mark]:
     """Let a strategy manage a stream; yield the memory at the ends of stages.
@@ -60,7 +60,7 @@ def managed(
         config: Its `memory` is the strategy; its network and seed are those of the stream.
         numerics: How descriptors and values are computed.
         ends: Names of stages by their last episode. The memory goes on to change after each.
-        way: How rewards are refreshed.
+        refresher: How rewards are refreshed.
         refresh_every: Actions between two times; 0: never.
     """
     memory = ReplayMemory(config.memory.capacity)
@@ -69,6 +69,8 @@ def managed(
     for turn in stream.turns():
         if turn.version != network.version:
             network.load(turn.version, stream.weights(turn.version))
+        if len(turn.rows):
+            refresher.note(int(turn.rows["id"][0]) - 1, len(turn.rows), network)
         memory.append(turn.rows, turn.images)
         began_s = time.process_time()
         done = maintain(memory, turn.now, config.memory, network, config.run.seed)
@@ -78,7 +80,7 @@ def managed(
             costs.removed += len(done.discarded.ids)
             costs.last_resort += done.discarded.told["last_resort"]
         if due(turn.now, 0, refresh_every):
-            refresh(way, memory, stream, network, config.memory)
+            refresher.refresh(memory, network)
         if stage := ends.get(turn.now.episode):
             yield Mark(stage, memory, costs, network)
 

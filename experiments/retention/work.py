@@ -10,7 +10,7 @@ Run again, it goes on: what is measured is left alone, and a recording continues
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import get_args
 
@@ -20,13 +20,14 @@ from experiments.plans.plan import Plan, stage_config
 from experiments.plans.scales import load_plan
 from experiments.retention.benchmark import Benchmark, Entry, Setting, Work, config_of
 from experiments.retention.contents import Mark, figures, managed
+from experiments.retention.refresh import Refresher
 from experiments.retention.stream import Recorder, Stream
 from experiments.retention.worth import driven, learned
 from experiments.runs.run import Run
 from shared.config import Config
 from shared.numerics import Role, settle
 from shared.provenance import machine_key
-from shared.run_record import RUN, RunInfo, made_here
+from shared.run_record import EPISODE_COLUMNS, EPISODES, RUN, RunInfo, made_here, read_csv
 from shared.statefile import write_atomically
 
 Tell = Callable[[str], None]
@@ -124,10 +125,10 @@ def _measured(benchmark: Benchmark, work: Work, stream: Stream, out: Path) -> Me
         for stage in info.stages
         if stage.last_episode is not None and stage.name in marks
     }
-    every = round(entry.refresh_every * config.memory.capacity)
+    losses = _losses(_run_folder(setting, seed, out))
     networks = [
         network
-        for mark in managed(stream, config, config.numerics.replay, ends, entry.refresh, every)
+        for mark in _marks(entry, stream, config, ends, losses)
         for network in _networks(benchmark, entry, mark, config)
     ]
     made = made_here()
@@ -140,6 +141,26 @@ def _measured(benchmark: Benchmark, work: Work, stream: Stream, out: Path) -> Me
         commit=str(made["commit"]),
         machine=str(made["machine"]),
     )
+
+
+def _marks(
+    entry: Entry,
+    stream: Stream,
+    config: Config,
+    ends: Mapping[int, str],
+    losses: Mapping[int, float],
+) -> Iterator[Mark]:
+    """The memories of an entry at the ends of stages."""
+    refresher = Refresher(entry.refresh, stream, config, losses)
+    every = round(entry.refresh_every * config.memory.capacity)
+    return managed(stream, config, config.numerics.replay, ends, refresher, every)
+
+
+def _losses(run: Path) -> dict[int, float]:
+    """The mean loss of the fitting phase behind each version of the network."""
+    rows = read_csv(run / EPISODES, EPISODE_COLUMNS)
+    fits = (row for row in rows if row["fitting"] == "1")
+    return {int(row["weights_version"]): float(row["loss"]) for row in fits}
 
 
 def _networks(benchmark: Benchmark, entry: Entry, mark: Mark, config: Config) -> list[Network]:

@@ -86,13 +86,13 @@ def maintain(
     discarded = discard(Situation(memory, now.episode, config, predictor, seed, describing))
     refresh = due(now, config.equalise_every, config.equalise_every_actions) and len(memory) > 0
     if refresh:
-        values = current_values(memory, predictor, equalising)
+        values = _current_values(memory, predictor, equalising)
         memory.rows["reward"] = equalised(memory.rows["reward"], values, config)
     return Maintenance(discarded, refresh)
 
 
-def current_values(
-    memory: ReplayMemory, predictor: Predictor, progress: Progress | None = None
+def _current_values(
+    memory: ReplayMemory, predictor: Predictor, progress: Progress | None
 ) -> npt.NDArray[np.float32]:
     """Return Q of each stored image and its action under the current weights: float32 [n]."""
     values = np.empty(len(memory), np.float32)

@@ -15,7 +15,7 @@ from experiments.retention import benchmark as benchmark_module
 from experiments.retention import work
 from experiments.retention.benchmark import Benchmark, Work, config_of, read_benchmark
 from experiments.retention.contents import managed
-from experiments.retention.refresh import Way, refresh
+from experiments.retention.refresh import Refresher, Way
 from experiments.retention.stream import Recorder, Stream
 from experiments.retention.work import Measured
 from experiments.runs.run import Run
@@ -121,7 +121,8 @@ def test_a_stream_gives_the_run_that_it_was_recorded_from(whole: Path) -> None:
     with np.load(whole / "x" / "run" / "state-end" / "memory.npz") as file:
         rows, images = file["rows"], file["images"]
     last = int(json.loads((whole / "x" / "run" / "run.json").read_text())["episodes"])
-    (mark,) = managed(stream, config, config.numerics.replay, {last: "minus"}, "none", 0)
+    refresher = Refresher("none", stream, config, {})
+    (mark,) = managed(stream, config, config.numerics.replay, {last: "minus"}, refresher, 0)
     found = mark.memory.rows.copy()
     for name in set(rows.dtype.names or ()) - {"slot"}:
         np.testing.assert_array_equal(found[name], rows[name], err_msg=name)
@@ -210,37 +211,67 @@ def test_the_memory_itself_refreshes_nothing(tiny: Plan) -> None:
         assert (memory.equalise_every, memory.equalise_every_actions) == (0, 0)
 
 
-def refreshed(whole: Path, way: Way, times: int = 1) -> Any:
+def refreshed(whole: Path, way: Way, losses: dict[int, float], times: int = 1) -> Any:
     """The first samples of a stream, refreshed with its last network: rows before and after."""
     stream, config = Stream(whole / "stream"), stage_config(TINY, 0, 1)
-    network, memory = Predictor(config.network, config.numerics.replay), ReplayMemory(200)
+    network = Predictor(config.network, config.numerics.replay)
+    refresher, memory = Refresher(way, stream, config, losses), ReplayMemory(200)
     memory.worlds = stream.worlds
     for turn in stream.turns():
         if turn.version != network.version:
             network.load(turn.version, stream.weights(turn.version))
+        refresher.note(int(turn.rows["id"][0]) - 1, len(turn.rows), network)
         memory.append(turn.rows, turn.images)
     before = memory.rows.copy()
     for _ in range(times):
-        refresh(way, memory, stream, network, config.memory)
-    return before, memory.rows, memory, network
+        refresher.refresh(memory, network)
+    return before, memory.rows, memory, network, refresher
 
 
 def test_ways_of_refreshing_are_what_they_say(whole: Path) -> None:
-    before, none, *_ = refreshed(whole, "none")
+    before, none, *_ = refreshed(whole, "none", {})
     np.testing.assert_array_equal(none["reward"], before["reward"])
-    before, blend, memory, network = refreshed(whole, "blend")
+    before, blend, memory, network, _ = refreshed(whole, "blend", {})
     images = memory.images(np.arange(len(memory)))
     q = np.array(
         [network.values(i[None], a[None])[0] for i, a in zip(images, before["action"], strict=True)]
     )
     once = 0.7 * before["reward"] + 0.3 * q
     np.testing.assert_allclose(blend["reward"], np.clip(once, -1, 1), atol=1e-6)
-    _, twice, *_ = refreshed(whole, "blend", times=2)
+    _, twice, *_ = refreshed(whole, "blend", {}, times=2)
     np.testing.assert_allclose(twice["reward"], np.clip(0.7 * once + 0.3 * q, -1, 1), atol=1e-6)
-    _, anchored, *_ = refreshed(whole, "anchored", times=2)
+    _, anchored, *_ = refreshed(whole, "anchored", {}, times=2)
     np.testing.assert_allclose(anchored["reward"], np.clip(once, -1, 1), atol=1e-6)
-    _, protected, *_ = refreshed(whole, "protected")
+    _, protected, *_ = refreshed(whole, "protected", {})
     terminal = before["reward"] == -1.0
     assert terminal.any()
     assert (protected["reward"][terminal] == -1.0).all()
     np.testing.assert_array_equal(protected["reward"][~terminal], blend["reward"][~terminal])
+
+
+def test_only_the_next_value_is_made_anew(whole: Path) -> None:
+    before, after, memory, network, _ = refreshed(whole, "next-value", {})
+    terminal = before["reward"] == -1.0
+    assert (after["reward"][terminal] == -1.0).all()
+    images = memory.images(np.arange(len(memory)))
+    changed = 0
+    for i in np.flatnonzero(after["reward"] != before["reward"]):
+        assert not terminal[i]
+        now = network.all_values(images[i + 1][None]).max()
+        rest = before["reward"][i] - after["reward"][i] + 0.2 * now
+        assert -0.2 - 1e-5 <= rest <= 0.2 + 1e-5  # 0.2 max Q, as it was then
+        changed += 1
+    assert changed > 50
+
+
+def test_a_fit_whose_loss_did_not_fall_refreshes_nothing(whole: Path) -> None:
+    before, _, _, network, _ = refreshed(whole, "none", {})
+    newest = network.version
+    for losses, same in (
+        ({newest - 1: 0.1, newest: 0.2}, True),
+        ({newest - 1: 0.2, newest: 0.1}, False),
+        ({newest: 0.1}, True),
+        ({}, True),
+    ):
+        _, after, *_ = refreshed(whole, "better-fits", losses)
+        assert (after["reward"].tobytes() == before["reward"].tobytes()) is same
