@@ -10,6 +10,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from experiments.plans.plan import Plan, merged, stage_config
 from experiments.plans.scales import load_plan
+from experiments.retention.offline import Method
 from experiments.retention.refresh import Way
 from shared.config import Config, Name, Section
 from shared.errors import ConfigError, first_problem
@@ -42,6 +43,8 @@ class Entry(Section):
     """How rewards are refreshed."""
     refresh_every: Annotated[float, Field(ge=0.0)] = 0.0
     """How often, in multiples of N actions; 0: never."""
+    offline: Method | None = None
+    """How it chooses from everything that came, in place of managing it as it comes."""
     steps: Annotated[int, Field(ge=0)] = 0
     """Gradient steps of its networks; 0: those of the benchmark."""
     networks: Count = 1

@@ -20,6 +20,7 @@ from experiments.plans.plan import Plan, stage_config
 from experiments.plans.scales import load_plan
 from experiments.retention.benchmark import Benchmark, Entry, Setting, Work, config_of
 from experiments.retention.contents import Mark, figures, managed
+from experiments.retention.offline import selected
 from experiments.retention.refresh import Refresher
 from experiments.retention.stream import Recorder, Stream
 from experiments.retention.worth import driven, learned
@@ -151,9 +152,12 @@ def _marks(
     losses: Mapping[int, float],
 ) -> Iterator[Mark]:
     """The memories of an entry at the ends of stages."""
+    numerics = config.numerics.replay
+    if entry.offline is not None:
+        return selected(stream, config, numerics, ends, entry.offline)
     refresher = Refresher(entry.refresh, stream, config, losses)
     every = round(entry.refresh_every * config.memory.capacity)
-    return managed(stream, config, config.numerics.replay, ends, refresher, every)
+    return managed(stream, config, numerics, ends, refresher, every)
 
 
 def _losses(run: Path) -> dict[int, float]:
