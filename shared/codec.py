@@ -8,12 +8,10 @@ from typing import Any, TypeVar
 import msgpack
 from pydantic import ValidationError
 
-from shared.errors import BadMessage
+from shared.errors import BadMessage, first_problem
 from shared.messages import PROTOCOL_VERSION, Message
 
 M = TypeVar("M", bound=Message)
-LONGEST_PLACE = 100
-"""Characters of a field name in an error: the sender may have made it up."""
 MAX_ARRAY, MAX_MAP, MAX_STR = 1000, 64, 4096
 """Entries of an array and of a map, bytes of a string: no message has more."""
 MAX_VALUES = 20_000
@@ -84,12 +82,3 @@ def _unpacked(data: bytes) -> Any:
         max_str_len=MAX_STR,
         max_ext_len=0,
     )
-
-
-def first_problem(error: ValidationError) -> str:
-    """The first complaint of a validation, in one line without the (possibly huge) input."""
-    problem = error.errors(include_url=False, include_input=False, include_context=False)[0]
-    where = ".".join(str(part) for part in problem["loc"])
-    if len(where) > LONGEST_PLACE or not where.isprintable():
-        where = brief(where)
-    return f"{where}: {problem['msg']}" if where else str(problem["msg"])

@@ -27,7 +27,6 @@ Name = Annotated[str, Field(pattern=NAME.pattern)]
 """A run, robot or world name: it becomes part of a Zenoh key, so no '/', '*', '$' or spaces."""
 
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
-Positive = Annotated[float, Field(gt=0.0)]
 
 
 class Section(BaseModel):

@@ -14,6 +14,17 @@ CorridorError
     └── RobotTaken     somebody else commands this robot
 """
 
+from __future__ import annotations
+
+from reprlib import repr as brief
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
+
+LONGEST_PLACE = 100
+"""Characters of a field name in an error: the sender may have made it up."""
+
 
 class CorridorError(Exception):
     """Base of all errors this project raises on purpose."""
@@ -65,3 +76,13 @@ class PeerRefused(BusError):
 
 class RobotTaken(BusError):
     """Somebody else commands this robot: there is one commander at a time."""
+
+
+def first_problem(error: ValidationError) -> str:
+    """The first complaint of a validation, in one line without the (possibly huge) input."""
+    problem = error.errors(include_url=False, include_input=False, include_context=False)[0]
+    where = ".".join(str(part) for part in problem["loc"])
+    if len(where) > LONGEST_PLACE or not where.isprintable():
+        where = brief(where)
+    text = problem["msg"].removeprefix("Value error, ")
+    return f"{where}: {text}" if where else text

@@ -18,29 +18,24 @@ needs Stable-Baselines3 (`make bench-peers` installs it into `.venv-peers`).
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import math
-import shlex
-import sys
 import time
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Annotated, Any
 
 import gymnasium
 import numpy as np
+import typer
 from gymnasium.wrappers import TimeLimit
 
 from experiments.drives.choosers import Chooser
 from experiments.drives.frozen_drives import evaluate
 from experiments.environment import CorridorEnv, Image
-from experiments.plans.plan import stage_config
-from experiments.plans.scales import SCALES, divisor_of, load_plan
+from experiments.plans.plan import Plan, stage_config
+from experiments.plans.scales import divisor_of, load_plan
 from experiments.records import EVALUATION_COLUMNS
-from services.robot_driver.simulated.world import WorldError
 from shared.config import Config
 from shared.errors import ConfigError
 from shared.run_record import RunInfo, StageInfo, append_csv, made_here, now_utc, write_csv
@@ -49,46 +44,11 @@ from shared.statefile import write_atomically
 NAMES = {"progress": "dqn-progress", "distance": "dqn-distance"}
 """Name of the experiment, by its reward."""
 STAGE = "learn"
-REWARDS = tuple(NAMES)
 TARGET_EVERY = 1000
 """Actions between copies of the target network."""
 EVALUATIONS = 10
 """In a run, at equal intervals."""
 EXIT_USAGE = 2
-
-
-class Learner(Protocol):
-    """What learns in the environment it was made with."""
-
-    def drive(self, actions: int) -> None:
-        """Drive this many more actions, with the training that falls due."""
-
-    @property
-    def actions(self) -> int:
-        """Driven so far, the random ones before learning not included."""
-
-    @property
-    def train_steps(self) -> int:
-        """Mini-batches trained so far."""
-
-    @property
-    def greedy(self) -> Chooser:
-        """The frozen policy."""
-
-
-@dataclass(frozen=True)
-class BaselinePlan:
-    """A run of the baseline, as the command line asks for it."""
-
-    config: Config
-    scale: str
-    factor: int
-    actions: int
-    reward: str
-    starts: int
-    drive_actions: int
-    out: Path
-    command: str
 
 
 class DistanceReward(gymnasium.Wrapper[Image, np.int64, Image, np.int64]):
@@ -123,22 +83,23 @@ class DistanceReward(gymnasium.Wrapper[Image, np.int64, Image, np.int64]):
 
 
 class Dqn:
-    """DQN of Stable-Baselines3 as a learner."""
+    """DQN of Stable-Baselines3 as a learner; it has driven the random actions already."""
 
-    def __init__(self, plan: BaselinePlan) -> None:
+    def __init__(self, config: Config, reward: str) -> None:
         from experiments.baseline import sb3
 
-        self._sb3, config = sb3, plan.config
+        self._sb3 = sb3
         sb3.use_threads(config.numerics.learner.threads)
         env: gymnasium.Env[Image, np.int64] = CorridorEnv(config=config)
-        if plan.reward == "distance":
+        if reward == "distance":
             env = DistanceReward(env, config)
         self._random = config.memory.capacity
         self._model = sb3.dqn(
             TimeLimit(env, config.episode.max_samples), config,
             random_steps=self._random, target_update_interval=TARGET_EVERY,
         )  # fmt: skip
-        self.greedy = sb3.greedy(self._model)
+        self.greedy: Chooser = sb3.greedy(self._model)
+        """The frozen policy."""
         self.drive(self._random)
 
     def drive(self, actions: int) -> None:
@@ -156,20 +117,25 @@ class Dqn:
         return self._sb3.mini_batches(self._model)
 
 
-def run(plan: BaselinePlan, learner: Learner) -> None:
+def run(config: Config, info: RunInfo, learner: Dqn, drives: tuple[int, int], out: Path) -> None:
     """Learn, evaluate at intervals; leaves `evaluations.csv` and `run.json` as our experiments do.
 
-    `seconds` is the wall time of learning alone.
+    Args:
+        config: World and robot.
+        info: What is to be run; `actions` are those after the random ones.
+        learner: Who learns.
+        drives: How many drives an evaluation has, and of how many actions each.
+        out: Folder of the run.
     """
-    plan.out.mkdir(parents=True, exist_ok=True)
-    table, seconds, began = plan.out / "evaluations.csv", 0.0, now_utc()
+    out.mkdir(parents=True, exist_ok=True)
+    table, seconds = out / "evaluations.csv", 0.0
     write_csv(table, EVALUATION_COLUMNS, ())
-    looker = CorridorEnv(config=plan.config)
+    looker = CorridorEnv(config=config)
     for number in range(1, EVALUATIONS + 1):
         begin_s = time.perf_counter()
-        learner.drive(plan.actions * number // EVALUATIONS - learner.actions)
+        learner.drive(info.actions * number // EVALUATIONS - learner.actions)
         seconds += time.perf_counter() - begin_s
-        found = evaluate(looker, learner.greedy, plan.starts, plan.drive_actions).figures
+        found = evaluate(looker, learner.greedy, *drives).figures
         row = {
             "label": "end" if number == EVALUATIONS else "every",
             "driver": "network",
@@ -177,110 +143,72 @@ def run(plan: BaselinePlan, learner: Learner) -> None:
             "episode": 0,
             "total_actions": learner.actions,
             "train_steps": learner.train_steps,
-            "world": plan.config.robot.world,
+            "world": config.robot.world,
             **{name: round(value, 6) for name, value in found.items()},
             "seconds": round(seconds, 1),
         }
         append_csv(table, EVALUATION_COLUMNS, [row])
     looker.close()
-    write_atomically(plan.out / "run.json", _told(plan, learner, seconds, began))
+    done = {"actions": learner.actions, "train_steps": learner.train_steps}
+    stage = {"name": STAGE, "world": config.robot.world, "first_episode": 0, "last_episode": 0}
+    over = {"finished": now_utc(), "complete": True, "seconds": round(seconds, 1)}
+    stages = (StageInfo.model_validate({**stage, **done}),)
+    told = info.model_copy(update={**over, **done, "stages": stages})
+    write_atomically(out / "run.json", told.to_json())
 
 
-def _told(plan: BaselinePlan, learner: Learner, seconds: float, began: str) -> bytes:
-    """What was run, with the names that reports of experiments read."""
-    counts = {"actions": learner.actions, "train_steps": learner.train_steps}
-    took_s = round(seconds, 1)
-    stage = StageInfo(
-        name=STAGE,
-        world=plan.config.robot.world,
-        first_episode=0,
-        last_episode=0,
-        seconds=took_s,
-        **counts,
-    )
-    return RunInfo(
-        experiment=NAMES[plan.reward],
-        title=f"DQN of Stable-Baselines3, reward {plan.reward}",
-        scale=plan.scale,
-        factor=plan.factor,
-        seed=plan.config.run.seed,
-        command=plan.command,
-        **made_here(),
-        started=began,
-        finished=now_utc(),
-        complete=True,
-        seconds=took_s,
-        stages=(stage,),
-        **counts,
-    ).to_json()
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the baseline; returns the exit code."""
-    words = sys.argv[1:] if arguments is None else list(arguments)
-    try:
-        plan = planned(words)
-    except ConfigError as error:
-        return _refused(str(error))
-    if importlib.util.find_spec("stable_baselines3") is None:
-        return _refused("stable_baselines3 is not installed: make bench-peers, then .venv-peers")
-    try:
-        learner = Dqn(plan)
-    except WorldError as error:
-        return _refused(str(error))
-    run(plan, learner)
-    return 0
-
-
-def planned(words: Sequence[str]) -> BaselinePlan:
-    """The plan that the command line asks for. Raises ConfigError."""
-    parser = argparse.ArgumentParser(
-        prog="python -m experiments.baseline.dqn", description=(__doc__ or "").split("\n")[0]
-    )
-    parser.add_argument("--like", default="plus-rmm", help="plan: world, network and memory")
-    parser.add_argument("--scale", choices=SCALES, default="tenth", help="of the plan")
-    parser.add_argument("--actions", type=_positive, default=50_000, help="after the random ones")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--reward", choices=REWARDS, default=REWARDS[0])
-    parser.add_argument("--starts", type=_positive, default=16, help="drives of an evaluation")
-    parser.add_argument("--drive-actions", type=_positive, default=400, help="of each drive")
-    parser.add_argument("--threads", type=_positive, default=1)
-    parser.add_argument("--out", type=Path, required=True)
-    given = parser.parse_args(words)
-    like = load_plan(given.like, given.scale)
-    ours = stage_config(like, len(like.stages) - 1, given.seed)
-    config = Config.model_validate(
+def shared_config(like: Plan, seed: int, reward: str, threads: int) -> Config:
+    """What the baseline has in common with the last stage of a plan. Raises ConfigError."""
+    if reward not in NAMES:
+        raise ConfigError(f"--reward: expected one of {', '.join(NAMES)}, got {reward!r}")
+    ours = stage_config(like, len(like.stages) - 1, seed)
+    return Config.model_validate(
         {
-            "run": {"name": NAMES[given.reward], "seed": given.seed},
+            "run": {"name": NAMES[reward], "seed": seed},
             "robot": ours.robot.model_dump(),
             "episode": ours.episode.model_dump(),
             "policy": {"kind": "eps-greedy", "epsilon": ours.policy.epsilon},
             "network": ours.network.model_dump(),
             "memory": {"capacity": ours.memory.capacity, "strategy": "normm"},
-            "numerics": {"learner": {"threads": given.threads}},
+            "numerics": {"learner": {"threads": threads}},
         }
     )
-    told = list(words)  # without where to: a place on this machine, and no part of what was run
-    if "--out" in told:
-        del told[told.index("--out") : told.index("--out") + 2]
-    command = shlex.join(["python", "-m", "experiments.baseline.dqn", *told])
-    return BaselinePlan(
-        config, given.scale, divisor_of(like, given.scale), given.actions,
-        given.reward, given.starts, given.drive_actions, given.out, command,
-    )  # fmt: skip
 
 
-def _positive(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"expected at least 1, got {number}")
-    return number
+app = typer.Typer(add_completion=False)
 
 
-def _refused(message: str) -> int:
-    sys.stderr.write(f"baseline_dqn: {message}\n")
-    return EXIT_USAGE
+@app.command()
+def main(
+    out: Annotated[Path, typer.Option(help="Folder of the run.")],
+    like: Annotated[str, typer.Option(help="Plan: world, network and memory.")] = "plus-rmm",
+    scale: Annotated[str, typer.Option(help="Of the plan.")] = "tenth",
+    actions: Annotated[int, typer.Option(min=1, help="After the random ones.")] = 50_000,
+    seed: Annotated[int, typer.Option(min=0)] = 1,
+    reward: Annotated[str, typer.Option(help="progress or distance.")] = "progress",
+    starts: Annotated[int, typer.Option(min=1, help="Drives of an evaluation.")] = 16,
+    drive_actions: Annotated[int, typer.Option(min=1, help="Of each drive.")] = 400,
+    threads: Annotated[int, typer.Option(min=1)] = 1,
+) -> None:
+    """Let DQN of Stable-Baselines3 learn in a corridor, evaluated as our experiments are."""
+    try:
+        plan = load_plan(like, scale)
+        config = shared_config(plan, seed, reward, threads)
+        if importlib.util.find_spec("stable_baselines3") is None:
+            raise ConfigError("stable_baselines3 is not installed: make bench-peers, .venv-peers")
+        info = RunInfo(
+            experiment=config.run.name, title=f"DQN of Stable-Baselines3, reward {reward}",
+            scale=scale, factor=divisor_of(plan, scale), seed=seed, actions=actions,
+            command=f"python -m experiments.baseline.dqn --like {like} --scale {scale} "
+            f"--reward {reward} --actions {actions} --seed {seed} --starts {starts} "
+            f"--drive-actions {drive_actions} --threads {threads}",
+            **made_here(), started=now_utc(), stages=(),
+        )  # fmt: skip
+        run(config, info, Dqn(config, reward), (starts, drive_actions), out)
+    except ConfigError as error:
+        typer.echo(f"baseline: {error}", err=True)
+        raise typer.Exit(EXIT_USAGE) from error
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    app()

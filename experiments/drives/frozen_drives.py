@@ -75,56 +75,61 @@ def drive(env: CorridorEnv, choose: Chooser, poses: Sequence[Pose], actions: int
         ValueError: A pose is inside a wall.
     """
     with ExitStack() as twins:
-        drives: list[_Drive] = []
+        drives: list[Drive] = []
         for number, pose in enumerate(poses):
-            own = twins.enter_context(_twin(env)) if number else env
-            drives.append(_Drive(own, number, pose, actions))
-        draws = [each.draw for each in drives]
-        for i in range(actions):
+            twin = CorridorEnv(config=env.config, robot=env.robot.twin()) if number else None
+            drives.append(Drive(twins.enter_context(twin) if twin else env, number, pose))
+        draws = [generator(SEED, "action", number) for number in range(len(poses))]
+        for _ in range(actions):
             chosen = choose([each.observation for each in drives], draws)
             for each, action in zip(drives, chosen, strict=True):
-                each.act(i, action)
+                each.act(action)
         return [each.trace() for each in drives]
 
 
-def _twin(env: CorridorEnv) -> CorridorEnv:
-    """Another robot in the same scene."""
-    return CorridorEnv(config=env.config, robot=env.robot.twin())
-
-
-class _Drive:
+class Drive:
     """One robot on its drive, and what happened so far."""
 
-    def __init__(self, env: CorridorEnv, number: int, pose: Pose, actions: int) -> None:
+    def __init__(self, env: CorridorEnv, number: int, pose: Pose) -> None:
+        """Stand the robot there; `number` seeds its recoveries."""
         self._env = env
         info = env.reset(seed=number, options={"pose": pose})[1]
         self.observation: Observation = info["observation"]
         """What the next action is chosen by."""
-        self.draw = generator(SEED, "action", number)
-        """Draws of who drives."""
-        self._bumps, self._way_m = np.zeros(actions, np.bool_), np.zeros(actions)
-        self._poses = np.zeros((actions + 1, 3))
-        self._poses[0] = pose.x_m, pose.y_m, pose.heading_rad
+        self._poses = [(pose.x_m, pose.y_m, pose.heading_rad)]
+        self.bumps: list[bool] = []
+        """Whether there was contact, by action or turn."""
+        self._way_m: list[float] = []
 
-    def act(self, i: int, action: int) -> None:
-        """Carry out action number `i`, recovery included."""
-        _, _, self._bumps[i], _, info = self._env.step(np.int64(action))
-        reached, before = self._env.robot.pose, self._poses[i]
-        self._way_m[i] = math.hypot(reached.x_m - before[0], reached.y_m - before[1])
-        if self._bumps[i]:
+    def act(self, action: int) -> bool:
+        """Carry out an action, recovery included; whether it bumped."""
+        _, _, bumped, _, info = self._env.step(np.int64(action))
+        reached, (x_m, y_m, _) = self._env.robot.pose, self._poses[-1]
+        way_m = math.hypot(reached.x_m - x_m, reached.y_m - y_m)
+        if bumped:
             _, info = self._env.reset()
-        self.observation = seen = info["observation"]
-        self._poses[i + 1] = seen.x_m, seen.y_m, seen.heading_rad
+        self._note(info["observation"], bumped, way_m)
+        return bumped
+
+    def turn(self, *, left: bool) -> None:
+        """Turn on the spot for the time of one action."""
+        self._note(self._env.turn(left), False, 0.0)
+
+    def _note(self, seen: Observation, bumped: bool, way_m: float) -> None:
+        self.observation = seen
+        self._poses.append((seen.x_m, seen.y_m, seen.heading_rad))
+        self.bumps.append(bumped)
+        self._way_m.append(way_m)
 
     def trace(self) -> Trace:
-        """The whole drive."""
-        laps = self._env.robot.laps
+        """The drive so far."""
+        laps, poses = self._env.robot.laps, np.array(self._poses)
         return Trace(
             world=self._env.robot.world.name,
-            bumps=self._bumps,
-            places_m=self._poses[:, :2],
-            headings_rad=self._poses[:, 2],
-            way_m=self._way_m,
+            bumps=np.array(self.bumps, np.bool_),
+            places_m=poses[:, :2],
+            headings_rad=poses[:, 2],
+            way_m=np.array(self._way_m),
             laps_left=laps.left,
             laps_right=laps.right,
         )

@@ -40,8 +40,7 @@ class Cells:
 
     def of(self, places_m: Floats) -> set[tuple[int, int]]:
         """The free cells in which places float64 [n, 2] lie."""
-        steps = np.floor((places_m - np.array(self.corner_m)) / CELL_M).astype(np.int64)
-        return {(int(x), int(y)) for x, y in steps} & self.free
+        return _steps(places_m, self.corner_m) & self.free
 
     def visited(self, places_m: Floats) -> float:
         """Part of the free cells in which places float64 [n, 2] lie."""
@@ -105,9 +104,14 @@ def start_poses(world: World, radius_m: float, count: int) -> list[Pose]:
 
 def _cells(world: World, points: Floats) -> Cells:
     """Those in which points float64 [n, 2] lie."""
-    x0, y0, _, _ = world.bounds
-    steps = np.unique(np.floor((points - (x0, y0)) / CELL_M).astype(np.int64), axis=0)
-    return Cells(frozenset((int(x), int(y)) for x, y in steps), (x0, y0))
+    corner_m = world.bounds[:2]
+    return Cells(frozenset(_steps(points, corner_m)), corner_m)
+
+
+def _steps(places_m: Floats, corner_m: tuple[float, float]) -> set[tuple[int, int]]:
+    """Columns and rows of the cells in which places float64 [n, 2] lie."""
+    steps = np.unique(np.floor((places_m - corner_m) / CELL_M).astype(np.int64), axis=0)
+    return {(int(x), int(y)) for x, y in steps}
 
 
 def _clearance(world: World, points: Floats) -> Floats:

@@ -8,13 +8,12 @@ alike still ranks actions well now and then; how far its predictions reach shows
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from experiments.drives.choosers import Chooser, Predicts
+from experiments.drives.choosers import Predicts
 from experiments.drives.frozen_drives import drive
 from experiments.drives.places import start_poses
 from experiments.drives.traces import Figures, Trace
@@ -28,17 +27,6 @@ Floats = npt.NDArray[np.float64]
 EXPLORING = PolicyConfig(kind="eps-greedy", epsilon=0.1)
 BEFORE_WALL = 6
 """An action hits a wall soon if the robot bumps within so many actions, itself counted."""
-
-
-class Judged(NamedTuple):
-    """Predictions of actions that were carried out, and what came of them."""
-
-    predicted: Floats
-    """[n]: Q of the action."""
-    observed: Floats
-    """[n]: its reward by Eq 3.1, from what followed."""
-    before_wall: npt.NDArray[np.bool_]
-    """[n]: whether it hit a wall within 6 actions."""
 
 
 def prediction_figures(env: CorridorEnv, network: Predicts, starts: int, actions: int) -> Figures:
@@ -56,33 +44,40 @@ def prediction_figures(env: CorridorEnv, network: Predicts, starts: int, actions
         value_slope: slope of the reward over Q; 1 where predictions reach as far as rewards.
         NaN where there are too few actions to tell.
     """
-    noting = _Noting(network)
+    noted: list[tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]] = []
+
+    def explore(
+        observations: Sequence[Observation], draws: Sequence[np.random.Generator]
+    ) -> list[int]:
+        values = network.all_values(np.stack([image_array(seen.image) for seen in observations]))
+        pairs = zip(values, draws, strict=True)
+        chosen = [choose(mine, EXPLORING, draw)[0] for mine, draw in pairs]
+        noted.append((values, np.array(chosen)))
+        return chosen
+
     poses = start_poses(env.world, env.config.robot.radius_m, starts)
-    traces = drive(env, noting.choose, poses, actions)
-    values = np.stack(noting.values, axis=1)  # [starts, actions, actions of the robot]
-    chosen = np.stack(noting.chosen, axis=1)
-    parts = [
-        judged(trace, own, took, env.config)
-        for trace, own, took in zip(traces, values, chosen, strict=True)
-    ]
-    return figures(Judged(*(np.concatenate(column) for column in zip(*parts, strict=True))))
+    traces = drive(env, explore, poses, actions)
+    values, chosen = (np.stack(column, axis=1) for column in zip(*noted, strict=True))
+    drives = zip(traces, values, chosen, strict=True)
+    return figures(np.concatenate([judged(*each, env.config) for each in drives], axis=1))
 
 
-def figures(found: Judged) -> Figures:
-    """The three figures of `prediction_figures`."""
+def figures(found: Floats) -> Figures:
+    """The three figures of `prediction_figures`, of what `judged` found."""
     nan = float("nan")
-    tells = len(found.predicted) > 2 and all(np.ptp(values) > 0.0 for values in found[:2])
-    near = found.predicted[found.before_wall]
+    predicted, observed, before_wall = found
+    tells = len(predicted) > 2 and np.ptp(predicted) > 0.0 and np.ptp(observed) > 0.0
+    near = predicted[before_wall > 0.0]
     return {
         "wall_value": float(near.mean()) if len(near) else nan,
-        "value_rank": float(stats.spearmanr(*found[:2]).statistic) if tells else nan,
-        "value_slope": float(np.polyfit(*found[:2], 1)[0]) if tells else nan,
+        "value_rank": float(stats.spearmanr(predicted, observed).statistic) if tells else nan,
+        "value_slope": float(np.polyfit(predicted, observed, 1)[0]) if tells else nan,
     }
 
 
 def judged(
     trace: Trace, values: npt.NDArray[np.float32], chosen: npt.NDArray[np.int64], config: Config
-) -> Judged:
+) -> Floats:
     """Predictions and rewards of one drive, as far as what followed was seen.
 
     Args:
@@ -90,71 +85,27 @@ def judged(
         values: float32 [n, actions]: clipped predictions before each action.
         chosen: [n]: the actions.
         config: Horizon and weights of the reward.
+
+    Returns:
+        float64 [3, k]: Q of each action, its reward by Eq 3.1 from what followed, and 1 where it
+        hit a wall within 6 actions, else 0.
     """
-    predicted = values[np.arange(len(chosen)), chosen].astype(np.float64)
-    nothing = Judged(np.zeros(0), np.zeros(0), np.zeros(0, np.bool_))
-    parts = [nothing]
-    for start, end in _stretches(trace.bumps):
+    n, horizon = len(chosen), config.episode.horizon
+    predicted = values[np.arange(n), chosen].astype(np.float64)
+    parts, start = [np.zeros((3, 0))], 0
+    for end in dict.fromkeys([*(np.flatnonzero(trace.bumps) + 1).tolist(), n]):
         bump = bool(trace.bumps[end - 1])
-        count = end - start if bump else end - start - config.episode.horizon
-        if count > 0:
-            stretch = slice(start, end)
-            parts.append(_between(trace, predicted, values, stretch, count, config))
-    return Judged(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-
-def _stretches(bumps: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Actions from one recovery to the next bump, that one included, and the rest."""
-    ends = [int(end) + 1 for end in np.flatnonzero(bumps)]
-    if not ends or ends[-1] < len(bumps):
-        ends.append(len(bumps))
-    return list(zip([0, *ends[:-1]], ends, strict=True))
-
-
-def _between(
-    trace: Trace,
-    predicted: Floats,
-    values: npt.NDArray[np.float32],
-    stretch: slice,
-    count: int,
-    config: Config,
-) -> Judged:
-    """The first `count` actions of a stretch: those whose look-ahead was seen."""
-    start, end = stretch.start, stretch.stop
-    bump = bool(trace.bumps[end - 1])
-    following = np.minimum(np.arange(start, start + count) + 1, len(values) - 1)
-    rewards = episode_rewards(
-        trace.places_m[stretch],
-        values[following].max(axis=1).astype(np.float64),
-        bump=bump,
-        horizon=config.episode.horizon,
-        max_distance_m=config.max_distance_m,
-        config=config.reward,
-    )
-    steps_to_end = np.arange(end - start - 1, end - start - 1 - count, -1)
-    return Judged(
-        predicted[start : start + count],
-        rewards.astype(np.float64),
-        (steps_to_end < BEFORE_WALL) & bump,
-    )
-
-
-class _Noting:
-    """Explores, and notes what the network predicted and what was chosen."""
-
-    def __init__(self, network: Predicts) -> None:
-        self._network = network
-        self.values: list[npt.NDArray[np.float32]] = []
-        self.chosen: list[npt.NDArray[np.int64]] = []
-        self.choose: Chooser = self._choose
-
-    def _choose(
-        self, observations: Sequence[Observation], draws: Sequence[np.random.Generator]
-    ) -> list[int]:
-        images = np.stack([image_array(seen.image) for seen in observations])
-        values = self._network.all_values(images)
-        pairs = zip(values, draws, strict=True)
-        chosen = [choose(mine, EXPLORING, draw)[0] for mine, draw in pairs]
-        self.values.append(values)
-        self.chosen.append(np.array(chosen))
-        return chosen
+        seen = np.arange(start, end if bump else max(end - horizon, start))
+        if len(seen):
+            rewards = episode_rewards(
+                trace.places_m[start:end],
+                values[np.minimum(seen + 1, n - 1)].max(axis=1).astype(np.float64),
+                bump=bump,
+                horizon=horizon,
+                max_distance_m=config.max_distance_m,
+                config=config.reward,
+            )
+            near = (end - 1 - seen < BEFORE_WALL) & bump
+            parts.append(np.stack([predicted[seen], rewards.astype(np.float64), near]))
+        start = end
+    return np.concatenate(parts, axis=1)

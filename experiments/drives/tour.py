@@ -8,20 +8,21 @@ the robot.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from experiments.drives.choosers import GREEDY, Predicts
+from experiments.drives.frozen_drives import Drive
 from experiments.drives.routes import Event, Route
-from experiments.drives.traces import Trace
 from experiments.environment import CorridorEnv
 from experiments.records import TourRecord
 from services.robot_driver.robot import Pose
 from services.robot_driver.simulated.world import World
+from services.robot_driver.simulated.world_parts import Place
 from shared.config import PolicyConfig
-from shared.messages import Box, Observation, WorldChange, image_array
+from shared.messages import Box, WorldChange, image_array
 from shared.rl.draws import generator
 from shared.rl.policy import choose
 from shared.rl.spot_turns import SpotTurns
@@ -44,41 +45,17 @@ ROLE = "tour"
 BOX_NAME = "dropped-box"
 
 
-@dataclass(frozen=True)
-class Tour:
+class Tour(NamedTuple):
     """What happened on one test drive."""
 
     route: Route
-    driven: int
-    turned: int
-    """Turns on the spot, each of one action's duration."""
-    route_share: float
-    bridges: tuple[str, ...]
-    box_dropped: bool
+    told: TourRecord
 
-    @property
-    def bumps(self) -> int:
-        """Bumps of the whole drive."""
-        return int(self.route.trace.bumps.sum())
 
-    @property
-    def told(self) -> TourRecord:
-        """The figures, for a file."""
-        return TourRecord(
-            passed=self.passed,
-            driven=self.driven,
-            turned=self.turned,
-            bumps=self.bumps,
-            route_share=round(self.route_share, 4),
-            bridges=self.bridges,
-            box_dropped=self.box_dropped,
-        )
-
-    @property
-    def passed(self) -> bool:
-        """A full tour without a bump, past the box."""
-        full = self.driven >= DRIVEN and self.route_share >= ROUTE_SHARE
-        return full and len(self.bridges) >= BRIDGES and self.box_dropped and not self.bumps
+def passes(told: TourRecord) -> bool:
+    """A full tour without a bump, past the box."""
+    full = told.driven >= DRIVEN and told.route_share >= ROUTE_SHARE
+    return full and len(told.bridges) >= BRIDGES and told.box_dropped and not told.bumps
 
 
 class _TestDrive:
@@ -88,14 +65,9 @@ class _TestDrive:
         self, env: CorridorEnv, network: Predicts, pose: Pose, number: int, policy: PolicyConfig
     ) -> None:
         self._env, self._network, self._policy = env, network, policy
-        info = env.reset(seed=number, options={"pose": pose})[1]
-        self._observation: Observation = info["observation"]
+        self._drive = Drive(env, number, pose)
         self._draw = generator(number, ROLE)
         self._spot_turns = SpotTurns(env.config.robot.turn_rad_s * env.config.robot.period_s)
-        self._poses = [(pose.x_m, pose.y_m, pose.heading_rad)]
-        self._bumps: list[bool] = []
-        self._way_m: list[float] = []
-        """Metres driven by each action, without recoveries."""
         self._events: list[Event] = []
         self._turned_at = -math.inf
         self._dropped_at: int | None = None
@@ -104,35 +76,24 @@ class _TestDrive:
 
     def act(self) -> None:
         """Drive or turn as the network says."""
-        values = self._network.all_values(image_array(self._observation.image)[None])[0]
+        values = self._network.all_values(image_array(self._drive.observation.image)[None])[0]
         action, _ = choose(values, self._policy, self._draw)
         if side := self._spot_turns.decide(values, action):
             if self.driven > self._turned_at + ONE_TURN:
-                self._tell(f"turns {side} on the spot")
+                self._tell(f"turns {side} on the spot", len(self._drive.bumps))
             self._turned_at = self.driven
-            self._observation = self._env.turn(side == "left")
+            self._drive.turn(left=side == "left")
             self.turned += 1
-            self._note(bump=False, way_m=0.0)
-        else:
-            self._drive(action)
-            self.driven += 1
-
-    def _drive(self, action: int) -> None:
-        before = self._env.robot.pose
-        _, _, bumped, _, info = self._env.step(np.int64(action))
-        here = self._env.robot.pose
-        way_m = math.hypot(here.x_m - before.x_m, here.y_m - before.y_m)
-        if bumped:
-            _, info = self._env.reset()
-            self._tell("bumps")
-        self._observation = info["observation"]
-        self._note(bump=bumped, way_m=way_m)
+            return
+        if self._drive.act(action):
+            self._tell("bumps", len(self._drive.bumps) - 1)
+        self.driven += 1
 
     def full(self) -> bool:
         """Whether the tour is full, in actions, route and bridges, and is past the box."""
         if self._dropped_at is None or self.driven < max(DRIVEN, self._dropped_at + BEYOND_BOX):
             return False
-        world, places_m = self._env.robot.world, np.array(self._poses)[:, :2]
+        world, places_m = self._env.robot.world, self._drive.trace().places_m
         bridges = _bridges(world, places_m)
         return len(bridges) >= BRIDGES and route_share(world, places_m) >= ROUTE_SHARE
 
@@ -144,55 +105,41 @@ class _TestDrive:
             return
         wish = WorldChange(kind="place", box=_box_ahead(pose))
         if self._env.driver.change(wish, at_once=True).accepted:
-            self._tell("a box drops in front of the robot")
+            self._tell("a box drops in front of the robot", len(self._drive.bumps))
             self._dropped_at = self.driven
-        self._observation = self._env.observe()
+        self._drive.observation = self._env.observe()
 
     def tell_passed(self) -> None:
         """Note named places the first time the robot comes past them."""
         route = self._env.robot.world.route
         assert route is not None
-        x, y, _ = self._poses[-1]
+        here = self._env.robot.pose
         told = {event.text for event in self._events}
         for place in route.places:
             text = f"at {place.name}"
-            if text not in told and math.hypot(place.x_m - x, place.y_m - y) <= NEAR_M / 2:
-                self._tell(text)
+            if text not in told and _apart_m(place, here) <= NEAR_M / 2:
+                self._tell(text, len(self._drive.bumps))
 
     def end(self) -> Tour:
         """Take the box away again and tell what happened."""
         dropped = self._dropped_at is not None
         if dropped:
             self._env.robot.remove(BOX_NAME)
-        world, poses = self._env.robot.world, np.array(self._poses)
-        laps = self._env.robot.laps
-        trace = Trace(
-            world=world.name,
-            bumps=np.array(self._bumps, np.bool_),
-            places_m=poses[:, :2],
-            headings_rad=poses[:, 2],
-            way_m=np.array(self._way_m),
-            laps_left=laps.left,
-            laps_right=laps.right,
+        world, trace = self._env.robot.world, self._drive.trace()
+        told = TourRecord(
+            passed=False,
+            driven=self.driven,
+            turned=self.turned,
+            bumps=sum(self._drive.bumps),
+            route_share=round(route_share(world, trace.places_m), 4),
+            bridges=_bridges(world, trace.places_m),
+            box_dropped=dropped,
         )
-        return Tour(
-            Route(trace, tuple(self._events)),
-            self.driven,
-            self.turned,
-            route_share(world, poses[:, :2]),
-            _bridges(world, poses[:, :2]),
-            dropped,
-        )
+        told = told.model_copy(update={"passed": passes(told)})
+        return Tour(Route(trace, tuple(self._events)), told)
 
-    def _tell(self, text: str) -> None:
-        self._events.append(Event(len(self._events) + 1, len(self._bumps), text))
-
-    def _note(self, *, bump: bool, way_m: float) -> None:
-        """An action or a turn is over."""
-        pose = self._env.robot.pose
-        self._poses.append((pose.x_m, pose.y_m, pose.heading_rad))
-        self._bumps.append(bump)
-        self._way_m.append(way_m)
+    def _tell(self, text: str, action: int) -> None:
+        self._events.append(Event(len(self._events) + 1, action, text))
 
 
 def drive_tour(
@@ -243,21 +190,19 @@ def _bridges(world: World, places_m: npt.NDArray[np.float64]) -> tuple[str, ...]
     return tuple(
         place.name
         for place in world.route.places
-        if place.kind == "bridge" and _nearest_m(places_m, place.x_m, place.y_m) <= NEAR_M
+        if place.kind == "bridge"
+        and np.hypot(*(places_m - (place.x_m, place.y_m)).T).min() <= NEAR_M
     )
-
-
-def _nearest_m(places_m: npt.NDArray[np.float64], x_m: float, y_m: float) -> float:
-    return float(np.hypot(places_m[:, 0] - x_m, places_m[:, 1] - y_m).min())
 
 
 def _at_junction(world: World, pose: Pose) -> bool:
     assert world.route is not None
-    return any(
-        place.kind == "junction"
-        and math.hypot(place.x_m - pose.x_m, place.y_m - pose.y_m) <= NEAR_M
-        for place in world.route.places
-    )
+    junctions = (place for place in world.route.places if place.kind == "junction")
+    return any(_apart_m(place, pose) <= NEAR_M for place in junctions)
+
+
+def _apart_m(place: Place, pose: Pose) -> float:
+    return math.hypot(place.x_m - pose.x_m, place.y_m - pose.y_m)
 
 
 def _box_ahead(pose: Pose) -> Box:

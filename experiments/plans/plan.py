@@ -18,7 +18,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from experiments.plans.presentation import INHERITED, Presentation
 from shared.config import Config, Name, PolicyConfig, Section
-from shared.errors import ConfigError
+from shared.errors import ConfigError, first_problem
 from shared.settings import preset_tree
 
 Tree = dict[str, Any]
@@ -144,7 +144,7 @@ def read_plan(name: str, text: str, folder: Traversable = PLANS) -> Plan:
     try:
         plan = Plan.model_validate({"name": name, **_tree((name,), text, folder)})
     except ValidationError as error:
-        raise ConfigError(_one_line(f"plan {name}", error)) from error
+        raise ConfigError(f"plan {name}: {first_problem(error)}") from error
     if plan.preset:
         plan = plan.model_copy(update={"config": merged(preset_tree(plan.preset), plan.config)})
     check(plan)
@@ -166,8 +166,7 @@ def stage_config(plan: Plan, index: int, seed: int) -> Config:
         return Config.model_validate(tree)
     except ValidationError as error:
         stage = f", stage {plan.stages[index].name}" if plan.stages else ""
-        where = f"plan {plan.name}{stage}"
-        raise ConfigError(_one_line(where, error)) from error
+        raise ConfigError(f"plan {plan.name}{stage}: {first_problem(error)}") from error
 
 
 def merged(tree: Tree, over: Mapping[str, Any]) -> Tree:
@@ -211,9 +210,3 @@ def _tree(names: tuple[str, ...], text: str, folder: Traversable) -> Tree:
     report = below.get("report", {})
     below["report"] = {key: report[key] for key in INHERITED if key in report}
     return merged(below, tree)
-
-
-def _one_line(where: str, error: ValidationError) -> str:
-    first = error.errors(include_url=False, include_context=False)[0]
-    key = ".".join(str(part) for part in first["loc"])
-    return f"{where}: {key}: {first['msg'].removeprefix('Value error, ')}"

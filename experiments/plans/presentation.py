@@ -15,21 +15,6 @@ from shared.config import Name, Section
 Names = Annotated[tuple[Name, ...], Field(strict=False)]
 
 
-class Expected(Section):
-    """What the thesis says of an experiment. The report tells whether a run agrees."""
-
-    balanced: bool | None = None
-    """Whether the memory holds about equally many samples of all actions at the end."""
-    loss_falls: bool | None = None
-    """Whether the loss is lower after the first fitting phase than before it."""
-    more_samples_of: Names = ()
-    """Two corridors; the memory holds more samples of the first at the end."""
-    fewer_bumps_than: Names = ()
-    """Experiments whose frozen networks bump more often."""
-    fitness_above: Names = ()
-    """Experiments whose highest mean fitness is lower."""
-
-
 class Claim(Section):
     """Something that the thesis says of an experiment, and the figure of a seed that shows it."""
 
@@ -47,12 +32,13 @@ class Claim(Section):
         "highest-capacity",
         "clean-tours",
         "fitness-beside",
+        "loss-after-fit",
     ]
     """What is measured: the names of `experiments/report/claims.py`."""
     others: Names = ()
     """Experiments that it is measured beside, with the same seed."""
     stage: str = ""
-    """The stage at whose end frozen networks drive."""
+    """The stage at whose end frozen networks drive; empty: the newest drive."""
     worlds: Names = ()
     """Where they drive, or the corridors whose samples are counted."""
     least: float | None = None
@@ -105,14 +91,13 @@ class Presentation(Section):
     the same corridors."""
     reference_of: Names = ()
     """Groups in which all others are compared with this experiment only."""
-    table: Literal["", "fitness", "first-lap"] = ""
+    table: Literal["", "fitness"] = ""
     """The table that this experiment has a row in."""
     full_scale: bool = True
     """Whether the plan is meant for the full scale, and its cost there is told."""
     figures: dict[str, str] = Field(default_factory=dict)
     """The figure of the thesis by the kind of ours: fitness, loss, memory, worlds, route, table,
     `probes-best-<world>`, `probes-last-<world>`."""
-    expected: Expected = Expected()
     comparisons: Annotated[tuple[Comparison, ...], Field(strict=False)] = ()
     claims: Annotated[tuple[Claim, ...], Field(strict=False)] = ()
 

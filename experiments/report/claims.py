@@ -9,7 +9,7 @@ That takes at least four seeds that agree.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from math import isfinite
+from math import inf, isfinite
 
 import numpy as np
 from scipy import stats
@@ -17,7 +17,15 @@ from scipy import stats
 from experiments.plans.presentation import Claim, Presentation
 from experiments.report.document import Section, Table
 from experiments.report.figures.progress import curve_of
-from experiments.report.measures import MISSING, kept, max_mean_fitness, number, spread
+from experiments.report.measures import (
+    MISSING,
+    highest,
+    kept,
+    loss_ratio,
+    max_mean_fitness,
+    number,
+    spread,
+)
 from experiments.report.run_folder import Experiment, RunFolder
 from shared.facts import SHORT_NAMES
 
@@ -43,36 +51,30 @@ def claims_sections(
     return sections
 
 
-def verdict(held: int, seeds: int) -> str:
-    """Judge a claim that held in so many of these seeds."""
+def judged(held: int, seeds: int) -> tuple[str, str]:
+    """Verdict on a claim that held in so many of these seeds, and the number with its interval."""
     if not seeds:
-        return "not run"
-    interval = stats.binomtest(held, seeds).proportion_ci(0.95, method="wilson")
-    if interval.low > 0.5:
-        return "supported"
-    return "contradicted" if interval.high < 0.5 else "undecided"
+        return "not run", "0 of 0"
+    found = stats.binomtest(held, seeds).proportion_ci(0.95, method="wilson")
+    verdict = "supported" if found.low > 0.5 else "undecided"
+    told = f"{held} of {seeds} ({number(100 * found.low)} to {number(100 * found.high)} %)"
+    return "contradicted" if found.high < 0.5 else verdict, told
 
 
 def holds(claim: Claim, value: float) -> bool:
     """Whether a claim holds in a seed with this figure."""
-    above = claim.least is None or value >= claim.least
-    return above and (claim.most is None or value <= claim.most)
+    least, most = claim.least, claim.most
+    return (-inf if least is None else least) <= value <= (inf if most is None else most)
 
 
 def _row(claim: Claim, experiment: Experiment, runs: Runs) -> tuple[str, ...]:
     text, measure = _FIGURES[claim.figure]
     found = (measure(run, claim, runs) for run in experiment.runs)
     values = np.array([value for value in found if isfinite(value)], np.float64)
-    held = sum(holds(claim, float(value)) for value in values)
-    told = f"{held} of {len(values)}"
-    if len(values):
-        interval = stats.binomtest(held, len(values)).proportion_ci(0.95, method="wilson")
-        told += f" ({number(100 * interval.low)} to {number(100 * interval.high)} %)"
     return (
         claim.text,
         claim.source,
-        verdict(held, len(values)),
-        told,
+        *judged(sum(holds(claim, float(value)) for value in values), len(values)),
         f"{text}: {spread(values)}" if len(values) else text,
         f"`corridor experiment {experiment.name} --scale {experiment.scale}`",
     )
@@ -114,17 +116,8 @@ def _samples_beside(run: RunFolder, claim: Claim, _: Runs) -> float:
     return float(counts[0][-1] / max(counts[1][-1], 1.0))
 
 
-def _highest(column: str) -> Callable[[RunFolder, Claim, Runs], float]:
-    def figure(run: RunFolder, _: Claim, __: Runs) -> float:
-        values = run.episodes.numbers(column)
-        known = run.info.complete and np.any(np.isfinite(values))
-        return float(np.nanmax(values)) if known else MISSING
-
-    return figure
-
-
-def _capacity(run: RunFolder, claim: Claim, runs: Runs) -> float:
-    return _highest("capacity")(run, claim, runs) * run.info.factor
+def _highest(run: RunFolder, column: str) -> float:
+    return highest(run, column) if run.info.complete else MISSING
 
 
 def _clean_tours(run: RunFolder, _: Claim, __: Runs) -> float:
@@ -139,7 +132,9 @@ def _fitness_beside(run: RunFolder, claim: Claim, runs: Runs) -> float:
 
 def _at_end(run: RunFolder, claim: Claim, column: str) -> float:
     """A column of the frozen drive in the first corridor of a claim, at the end of its stage."""
-    rows = run.evaluated(claim.worlds[0]).where(label=f"stage {claim.stage}")
+    rows = run.evaluated(claim.worlds[0])
+    if claim.stage:
+        rows = rows.where(label=f"stage {claim.stage}")
     return float(rows.numbers(column)[-1]) if len(rows) else MISSING
 
 
@@ -156,9 +151,15 @@ _FIGURES: Mapping[str, tuple[str, Callable[[RunFolder, Claim, Runs], float]]] = 
     "lowest-fitness": ("lowest mean fitness as a part of the median", _lowest_fitness),
     "kept": ("way between bumps, after the other corridor over before", _kept),
     "samples-beside": ("samples of the first corridor for each of the second", _samples_beside),
-    "highest-threshold": ("highest threshold (%)", _highest("threshold_percent")),
-    "highest-capacity": ("highest capacity, as large as in the thesis", _capacity),
+    "highest-threshold": (
+        "highest threshold (%)", lambda run, _, __: _highest(run, "threshold_percent"),
+    ),
+    "highest-capacity": (
+        "highest capacity, as large as in the thesis",
+        lambda run, _, __: _highest(run, "capacity") * run.info.factor,
+    ),
     "clean-tours": ("test drives that were full and without a bump", _clean_tours),
     "fitness-beside": ("highest mean fitness over that of the lowest other", _fitness_beside),
-}
+    "loss-after-fit": ("loss after the first fit over before", lambda run, _, __: loss_ratio(run)),
+}  # fmt: skip
 """What the figure of a seed is called, and how it is found. NaN: it is not known."""

@@ -11,11 +11,11 @@ from functools import partial
 
 from experiments.plans.presentation import Presentation
 from experiments.report import findings, tables
-from experiments.report.document import Block, Findings, Missing, Picture, Section, sentences
+from experiments.report.document import Block, Missing, Picture, Section, sentences
 from experiments.report.figures import drives
 from experiments.report.figures.style import told_apart
-from experiments.report.measures import compare
 from experiments.report.named_comparisons import Company, named_comparison
+from experiments.report.ratios import newest_drives, ratio_blocks, ratios
 from experiments.report.run_folder import Experiment
 
 
@@ -30,18 +30,12 @@ def compare_all(
     """
     sections = []
     for scale in sorted({experiment.scale for experiment in experiments}):
-        of_scale = [e for e in experiments if e.scale == scale]
+        of_scale = {e.name: e for e in experiments if e.scale == scale}
         if len(of_scale) > 1:
-            of_scale.sort(key=lambda experiment: _rank(experiment, shown))
-            company = Company({e.name: e for e in of_scale}, shown, scale)
+            company = Company(of_scale, shown, scale)
             blocks = (*_tables(company), *_frozen(company), *_named(company))
             sections.append(Section(f"comparisons-{scale}", f"Comparisons, {scale} scale", blocks))
     return sections
-
-
-def _rank(experiment: Experiment, shown: Mapping[str, Presentation]) -> tuple[int, str]:
-    """What is expected to bump less comes first, so that a negative difference agrees with it."""
-    return (-len(shown[experiment.name].expected.fewer_bumps_than), experiment.name)
 
 
 def _tables(company: Company) -> list[Block]:
@@ -52,18 +46,13 @@ def _tables(company: Company) -> list[Block]:
     if fitness:
         figures = (company.shown[e.name].figures.get("table") for e in fitness)
         blocks.append(tables.fitness(fitness, scale, next(filter(None, figures), "")))
-        blocks += sentences(
-            [*findings.fitness_order(fitness, company.shown), *findings.same_start(fitness)]
-        )
-    variants = [e for e in members.values() if company.shown[e.name].table == "first-lap"]
-    if len(variants) > 1:
-        blocks.append(tables.first_laps(company.references_first(variants), scale))
+        blocks += sentences(findings.same_start(fitness))
     memories = tables.memories(list(members.values()), scale)
     return [*blocks, memories] if len(memories.rows) > 1 else blocks
 
 
 def _frozen(company: Company) -> list[Block]:
-    """Frozen drives of the experiments of each group together, and their differences."""
+    """Frozen drives of the experiments of each group together, and their ratios of bumps."""
     groups: dict[tuple[str, ...], list[Experiment]] = {}
     for name, experiment in company.experiments.items():
         worlds = sorted({stage.world for stage in experiment.first.stages})
@@ -72,12 +61,12 @@ def _frozen(company: Company) -> list[Block]:
     blocks: list[Block] = []
     for (group, *worlds), members in groups.items():
         if len(members) > 1:
-            members = company.references_first(members, group)
+            members.sort(key=lambda e: group not in company.shown[e.name].reference_of)
             name = "-".join((group, *worlds))
-            blocks += [
-                *_curves(company, name, members),
-                *_differences(company, group, name, members),
-            ]
+            first_only = group in company.shown[members[0].name].reference_of
+            blocks += _curves(company, name, members)
+            blocks += _ratios(f"{company.scale}-ratios-{name}", members, first_only)
+            blocks += sentences(findings.same_start(members))
     return blocks
 
 
@@ -101,27 +90,15 @@ def _curves(company: Company, name: str, members: Sequence[Experiment]) -> list[
     ]
 
 
-def _differences(
-    company: Company, group: str, name: str, members: Sequence[Experiment]
-) -> list[Block]:
-    first_only = group in company.shown[members[0].name].reference_of
-    pairs, refused = compare(members, first_only=first_only)
-    blocks: list[Block] = []
-    if pairs:
-        caption = (
-            "Difference of mean bumps per 1,000 actions of the newest frozen drives. The 95 % "
-            "interval is a bootstrap over seeds and too narrow with few seeds. Filled marks: it "
-            "excludes 0."
-        )
-        title = "Differences between experiments"
-        drawn = partial(drives.differences, pairs)
-        blocks.append(Picture(f"{company.scale}-differences-{name}", title, caption, drawn))
-        told = [findings.difference(pair, company.expected_better(pair)) for pair in pairs]
-        blocks.append(Findings((*told, *findings.same_start(members))))
-    if refused:
-        why = f"at least 2 seeds of each are needed, but there are: {'; '.join(refused)}"
-        blocks.append(Missing("difference of bumps", why))
-    return blocks
+def _ratios(name: str, members: Sequence[Experiment], first_only: bool) -> list[Block]:
+    """Newest bumps of each experiment, or of the first only, beside those that come after it."""
+    found = []
+    for place, ours in enumerate(members[:1] if first_only else members, 1):
+        for world in ours.worlds:
+            drove = {each.name: newest_drives(each, world) for each in members}
+            others = [each.name for each in members[place:]]
+            found += ratios(ours.name, others, world, drove)
+    return ratio_blocks(name, "Bumps of the newest frozen drives, seed by seed", found)
 
 
 def _named(company: Company) -> list[Block]:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from html import escape
 from pathlib import Path
+from typing import TypeVar
 
-from jinja2 import Environment
+from markdown_it import MarkdownIt
 from matplotlib.figure import Figure
 
 from experiments.report.figures.style import png
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -69,6 +73,14 @@ class Section:
     blocks: tuple[Block, ...]
 
 
+def table(
+    name: str, title: str, items: Iterable[T], columns: Mapping[str, Callable[[T], str]]
+) -> Table:
+    """A row for each item; `columns` by what stands above them."""
+    rows = (tuple(told(item) for told in columns.values()) for item in items)
+    return Table(name, title, tuple(columns), tuple(rows))
+
+
 def write_pictures(sections: Sequence[Section], folder: Path) -> None:
     """Write every picture as `<name>.png`."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -119,88 +131,37 @@ def _cell(text: str) -> str:
 
 
 def html(title: str, sections: Sequence[Section]) -> str:
-    """One page that needs no other file: pictures and style are inside."""
-    template = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(_PAGE)
-    return template.render(title=title, sections=sections, kind=_kind, code=_is_code, data=_data)
+    """One page that needs no other file: the Markdown as HTML, with pictures and style inside."""
+    parser = MarkdownIt("commonmark", {"html": False}).enable("table")
+    links = (f'<li><a href="#{s.name}">{escape(s.title)}</a></li>' for s in sections)
+    parts = [f"<h1>{escape(title)}</h1>", "<ul>", *links, "</ul>"]
+    for section in sections:
+        parts.append(f'<h2 id="{section.name}">{escape(section.title)}</h2>')
+        for block in section.blocks:
+            text = parser.render(block_text(block, "figures"))
+            if isinstance(block, Picture):
+                data = base64.b64encode(block.image).decode("ascii")
+                text = text.replace(f"figures/{block.name}.png", f"data:image/png;base64,{data}")
+            parts.append(text)
+    return _HEAD.replace("TITLE", escape(title)) + "\n".join(parts) + "\n</body>\n</html>\n"
 
 
-def _kind(block: Block) -> str:
-    return type(block).__name__.lower()
-
-
-def _is_code(cell: str) -> bool:
-    """Whether it stands between backticks, as code does in Markdown."""
-    return len(cell) > 1 and cell[0] == cell[-1] == "`"
-
-
-def _data(picture: Picture) -> str:
-    return "data:image/png;base64," + base64.b64encode(picture.image).decode("ascii")
-
-
-_PAGE = """<!DOCTYPE html>
+_HEAD = """<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{ title }}</title>
+<title>TITLE</title>
 <style>
 body { font: 16px/1.5 system-ui, sans-serif; color: #222; background: #fff;
        max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
 h1, h2 { line-height: 1.2; }
 h2 { margin-top: 3rem; border-top: 1px solid #ddd; padding-top: 1rem; }
-figure { margin: 1.5rem 0; }
-figure img { max-width: 100%; height: auto; }
-figcaption, caption { font-size: 0.9rem; text-align: left; }
-.scroll { overflow-x: auto; margin: 1.5rem 0; }
-table { border-collapse: collapse; font-size: 0.85rem; }
-caption { font-weight: 600; padding-bottom: 0.3rem; }
+img { max-width: 100%; height: auto; }
+table { display: block; overflow-x: auto; border-collapse: collapse; font-size: 0.85rem; }
 th, td { text-align: left; padding: 0.2rem 0.7rem 0.2rem 0; border-bottom: 1px solid #e5e5e5;
          vertical-align: top; }
-.missing { color: #777; font-style: italic; }
 </style>
 </head>
 <body>
-<h1>{{ title }}</h1>
-<ul>
-{% for section in sections %}
-<li><a href="#{{ section.name }}">{{ section.title }}</a></li>
-{% endfor %}
-</ul>
-{% for section in sections %}
-<h2 id="{{ section.name }}">{{ section.title }}</h2>
-{% for block in section.blocks %}
-{% if kind(block) == "picture" %}
-<figure>
-<img src="{{ data(block) }}" alt="{{ block.title }}">
-<figcaption><b>{{ block.title }}.</b> {{ block.caption }}</figcaption>
-</figure>
-{% elif kind(block) == "table" %}
-<div class="scroll"><table>
-<caption>{{ block.title }}</caption>
-<tr>{% for cell in block.header %}<th>{{ cell }}</th>{% endfor %}</tr>
-{% for row in block.rows %}
-<tr>
-{% for cell in row %}
-{% if code(cell) %}
-<td><code>{{ cell.strip("`") }}</code></td>
-{% else %}
-<td>{{ cell }}</td>
-{% endif %}
-{% endfor %}
-</tr>
-{% endfor %}
-</table></div>
-{% elif kind(block) == "findings" %}
-<ul>
-{% for sentence in block.sentences %}
-<li>{{ sentence }}</li>
-{% endfor %}
-</ul>
-{% else %}
-<p class="missing">Left out: {{ block.what }}: {{ block.why }}.</p>
-{% endif %}
-{% endfor %}
-{% endfor %}
-</body>
-</html>
 """

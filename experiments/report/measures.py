@@ -1,24 +1,21 @@
-"""Single numbers of runs, how they are written, and comparisons of seeds."""
+"""Single numbers of runs, and how they are written."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import dropwhile, takewhile
 
 import numpy as np
 
 from experiments.drives.traces import FULL_RUN
-from experiments.report.figures.drives import Compared, laps
+from experiments.report.figures.drives import LAPS
 from experiments.report.figures.progress import curve_of
 from experiments.report.run_folder import Experiment, Floats, Rows, RunFolder
-from experiments.report.statistics import bootstrap_difference
-from shared.rl.draws import generator
 from shared.run_record import RunInfo
 
 MISSING = float("nan")
-BOOTSTRAP_SEED = 0
 
 
 @dataclass(frozen=True)
@@ -35,7 +32,8 @@ class Measure:
         return value / info.factor if self.grows else value
 
 
-def _highest(run: RunFolder, column: str) -> float:
+def highest(run: RunFolder, column: str) -> float:
+    """The largest number in a column of the episodes."""
     values = run.episodes.numbers(column)
     return float(np.nanmax(values)) if np.any(~np.isnan(values)) else MISSING
 
@@ -43,6 +41,16 @@ def _highest(run: RunFolder, column: str) -> float:
 def max_mean_fitness(run: RunFolder) -> float:
     """Highest point of the fitness curve (A38)."""
     return float(np.max(curve_of(run, "fitness")[1], initial=-math.inf))
+
+
+def loss_ratio(run: RunFolder) -> float:
+    """Loss after the first fitting phase over that before it; without one, last over first."""
+    places, means = curve_of(run, "loss")
+    fits = run.episodes.numbers("episode")[run.episodes.numbers("fitting") > 0]
+    before, after = means[:1], means[1:][-1:]
+    if len(fits):
+        before, after = means[places < fits[0]][-1:], means[places > fits[0] + run.window]
+    return float(np.median(after) / before[0]) if len(before) and len(after) else MISSING
 
 
 def longest_run_episode(run: RunFolder) -> float:
@@ -66,7 +74,7 @@ MEASURED = {
     "actions": Measure("actions", lambda run: float(run.actions), grows=True),
     "actions_per_episode": Measure("actions per episode", actions_per_episode),
     "capacity": Measure(
-        "largest capacity of the memory", lambda run: _highest(run, "capacity"), grows=True
+        "largest capacity of the memory", lambda run: highest(run, "capacity"), grows=True
     ),
     "longest_run": Measure("most actions without a bump", longest_run, grows=True),
     "longest_run_episode": Measure(
@@ -74,7 +82,7 @@ MEASURED = {
     ),
     "fitness": Measure("highest mean fitness", max_mean_fitness),
     "max_threshold_percent": Measure(
-        "highest threshold (%)", lambda run: _highest(run, "threshold_percent")
+        "highest threshold (%)", lambda run: highest(run, "threshold_percent")
     ),
 }
 """What stands in `thesis` of run.json under these names is shown beside ours (E37)."""
@@ -96,104 +104,10 @@ def evaluated(column: str, world: str, driver: str = "network") -> Callable[[Run
 
     def measure(run: RunFolder) -> float:
         rows = newest(run, world, driver)
-        values = laps(rows) if column == "laps" else rows.numbers(column)
+        values = LAPS.of(rows) if column == "laps" else rows.numbers(column)
         return float(values[0]) if len(values) else MISSING
 
     return measure
-
-
-def compare(
-    experiments: Sequence[Experiment], *, first_only: bool = False
-) -> tuple[list[Compared], list[str]]:
-    """Differences of bumps between pairs that drove in the same world.
-
-    Args:
-        experiments: At least two.
-        first_only: Only pairs with the first of them, in place of all.
-
-    Returns:
-        The differences, and a few words for every pair with fewer than 2 seeds of either.
-    """
-    pairs, refused = [], []
-    for i, ours in enumerate(experiments[:1] if first_only else experiments):
-        for theirs in experiments[i + 1 :]:
-            for world in sorted({*ours.worlds} & {*theirs.worlds}):
-                bumps = evaluated("bumps_per_1000", world)
-                a, b = of_seeds(ours, bumps), of_seeds(theirs, bumps)
-                draw = generator(BOOTSTRAP_SEED, "bootstrap", ours.name, theirs.name, world)
-                if min(len(a), len(b)) < 2:
-                    names = f"{ours.name} and {theirs.name} in {world}"
-                    refused.append(f"{names}: {len(a)} and {len(b)} seeds")
-                    continue
-                difference = bootstrap_difference(a, b, draw)
-                pairs.append(Compared(ours.name, theirs.name, world, (len(a), len(b)), difference))
-    return pairs, refused
-
-
-@dataclass(frozen=True)
-class Equal:
-    """Bumps per 1,000 actions of two networks of one seed after equally many actions of learning.
-
-    Each is the newest frozen drive up to there, which may be some actions older.
-    """
-
-    seed: int
-    actions: int
-    ours: float
-    theirs: float
-
-
-def at_equal_actions(
-    ours: Experiment, theirs: Experiment, named: Mapping[str, Experiment], world: str
-) -> list[Equal]:
-    """Seeds of both, each after as many actions as the one that drove less.
-
-    Args:
-        ours: One experiment.
-        theirs: The other.
-        named: Experiments by name, among them those that the two go on from: their drives and
-            actions come before.
-        world: Where they drove frozen.
-    """
-    found = []
-    rivals = {run.info.seed: run for run in theirs.runs}
-    for run in ours.runs:
-        if (rival := rivals.get(run.info.seed)) is None:
-            continue
-        curves = [_with_before(each, named, world) for each in (run, rival)]
-        if not all(len(actions) for actions, _ in curves):
-            continue
-        end = min(actions[-1] for actions, _ in curves)
-        if any(actions[0] > end for actions, _ in curves):
-            continue
-        a, b = (bumps[np.searchsorted(actions, end, "right") - 1] for actions, bumps in curves)
-        found.append(Equal(run.info.seed, int(end), float(a), float(b)))
-    return found
-
-
-def _with_before(
-    run: RunFolder, named: Mapping[str, Experiment], world: str
-) -> tuple[Floats, Floats]:
-    """Actions driven while learning, and bumps of frozen drives, predecessors' first."""
-    rows = run.evaluated(world)
-    actions, bumps = rows.numbers("total_actions"), rows.numbers("bumps_per_1000")
-    for before in named[run.info.after].runs if run.info.after in named else ():
-        if before.info.seed == run.info.seed:
-            earlier = _with_before(before, named, world)
-            actions, bumps = np.append(earlier[0], actions), np.append(earlier[1], bumps)
-    return actions, bumps
-
-
-def difference_at_equal_actions(
-    ours: str, theirs: str, world: str, found: Sequence[Equal]
-) -> Compared | None:
-    """The difference over all seeds; None with fewer than two."""
-    if len(found) < 2:
-        return None
-    draw = generator(BOOTSTRAP_SEED, "equal-actions", ours, theirs, world)
-    groups = np.array([(each.ours, each.theirs) for each in found]).T
-    difference = bootstrap_difference(groups[0], groups[1], draw)
-    return Compared(ours, theirs, world, (len(found), len(found)), difference)
 
 
 @dataclass(frozen=True)

@@ -8,16 +8,10 @@ from functools import partial
 
 from experiments.plans.presentation import Comparison, Presentation
 from experiments.report import findings
-from experiments.report.document import Block, Findings, Missing, Picture, Table, sentences
+from experiments.report.document import Block, Findings, Missing, Picture, Table
 from experiments.report.figures import probes, progress
-from experiments.report.figures.drives import Compared
-from experiments.report.measures import (
-    at_equal_actions,
-    difference_at_equal_actions,
-    kept,
-    number,
-)
-from experiments.report.ratios import ratio_table, ratios, stage_drives, told
+from experiments.report.measures import kept, number
+from experiments.report.ratios import drives_at_equal_actions, ratio_blocks, ratios, stage_drives
 from experiments.report.run_folder import Experiment
 
 PROBES_SHOWN = 6
@@ -31,24 +25,6 @@ class Company:
     """Experiments by name, in the order in which they are shown."""
     shown: Mapping[str, Presentation]
     scale: str
-
-    def references_first(
-        self, members: Sequence[Experiment], group: str | None = None
-    ) -> list[Experiment]:
-        """The same experiments, first those that others (of a group) are compared with."""
-
-        def later(experiment: Experiment) -> bool:
-            references = self.shown[experiment.name].reference_of
-            return group not in references if group else not references
-
-        return sorted(members, key=later)
-
-    def expected_better(self, pair: Compared) -> str | None:
-        """Which of two the thesis holds for the one with fewer bumps, if it says so."""
-        for better, worse in ((pair.ours, pair.theirs), (pair.theirs, pair.ours)):
-            if better in self.shown and worse in self.shown[better].expected.fewer_bumps_than:
-                return better
-        return None
 
 
 def named_comparison(company: Company, ours: Experiment, named: Comparison) -> list[Block]:
@@ -80,9 +56,7 @@ def _continued(company: Company, ours: Experiment, named: Comparison) -> list[Bl
     before = company.experiments[earlier]
     caption = f"Mean fitness of the seeds. Red line: where {ours.name} begins."
     drawn = partial(progress.continued, before, ours)
-    picture = Picture(f"{ours.full_name}-continued", what, caption, drawn)
-    told = findings.continued(before, ours, of_thesis=bool(named.figure))
-    return [picture, *sentences(told)]
+    return [Picture(f"{ours.full_name}-continued", what, caption, drawn)]
 
 
 def _fitness(company: Company, ours: Experiment, named: Comparison) -> list[Block]:
@@ -97,30 +71,19 @@ def _fitness(company: Company, ours: Experiment, named: Comparison) -> list[Bloc
     )
     drawn = partial(progress.compared, together)
     picture = Picture(f"{ours.full_name}-fitness-compared", what, caption, drawn)
-    return [picture, *sentences(findings.fitness_order(together, company.shown))]
+    return [picture, Findings((findings.highest_fitness(together),))]
 
 
 def _equal_actions(company: Company, ours: Experiment, named: Comparison) -> list[Block]:
     """Bumps beside every other experiment that was run, after equally many actions of a seed."""
-    blocks: list[Block] = []
-    for other in named.others:
-        theirs = company.experiments.get(other)
-        if theirs is None:
-            continue
-        found = at_equal_actions(ours, theirs, company.experiments, named.world)
-        if not found:
-            continue
-        rows = tuple(
-            (str(e.seed), f"{e.actions:,}", number(e.ours), number(e.theirs)) for e in found
-        )
-        title = f"Bumps per 1,000 actions, frozen in {named.world}, after equally many actions"
-        header = ("seed", "actions of learning", ours.name, other)
-        name = f"{ours.full_name}-equal-actions-{other}"
-        blocks.append(Table(name, f"{title}: {ours.name} and {other}", header, rows))
-        if pair := difference_at_equal_actions(ours.name, other, named.world, found):
-            told = findings.difference(pair, company.expected_better(pair))
-            blocks.append(Findings((f"After equally many actions, {told}",)))
-    return blocks
+    found = []
+    rivals = [company.experiments[name] for name in named.others if name in company.experiments]
+    for theirs in rivals:
+        both = drives_at_equal_actions(ours, theirs, company.experiments, named.world)
+        drives = dict(zip((ours.name, theirs.name), both, strict=True))
+        found += ratios(ours.name, [theirs.name], named.world, drives)
+    title = f"Bumps of {ours.name} after as many actions of learning"
+    return ratio_blocks(f"{ours.full_name}-equal-actions", title, found) if rivals else []
 
 
 def _predictions(company: Company, ours: Experiment, named: Comparison) -> list[Block]:
@@ -137,10 +100,7 @@ def _predictions(company: Company, ours: Experiment, named: Comparison) -> list[
         return [Missing(what, f"{without} has no predictions for {named.world}")]
     if not probes.same_images(first.probes, second.probes):
         return [Missing(what, "the two were asked about different images")]
-    networks = [
-        probes.Predictions(ours.name, first.probes.values),
-        probes.Predictions(other, second.probes.values),
-    ]
+    networks = {ours.name: first.probes.values, other: second.probes.values}
     caption = (
         f"Upper bars: {ours.name}, seed {first.seed}, {first.weights}; lower bars: {other}, seed "
         f"{second.seed}, {second.weights}. From −1 to 1."
@@ -174,7 +134,7 @@ def _kept(company: Company, ours: Experiment, named: Comparison) -> list[Block]:
     )
     header = ("seed", "before other corridors", "after them", "kept")
     table = Table(f"{ours.full_name}-kept", title, header, rows)
-    return [table, Findings(tuple(findings.kept_share(found, world)))]
+    return [table, Findings((findings.kept_share(found, world),))]
 
 
 def _ratios(company: Company, ours: Experiment, named: Comparison) -> list[Block]:
@@ -182,22 +142,14 @@ def _ratios(company: Company, ours: Experiment, named: Comparison) -> list[Block
     blocks: list[Block] = []
     others = [name for name in named.others if name in company.experiments]
     members = [ours, *(company.experiments[name] for name in others)]
-    for stage in ours.first.stages:
-        found = [
-            ratio
-            for world in ours.worlds
-            for ratio in ratios(
-                ours.name,
-                others,
-                world,
-                {member.name: stage_drives(member, stage.name, world) for member in members},
-            )
-        ]
-        if found:
-            title = f"Bumps at the end of {stage.name} beside {', '.join(others)}"
-            name = f"{ours.full_name}-ratios-{stage.name}"
-            blocks += [ratio_table(name, title, found), Findings(tuple(told(found)))]
-    return blocks or [Missing(f"ratios of bumps of {ours.name}", "fewer than two common seeds")]
+    for stage in ours.first.stages if others else ():
+        found = []
+        for world in ours.worlds:
+            drives = {member.name: stage_drives(member, stage.name, world) for member in members}
+            found += ratios(ours.name, others, world, drives)
+        title = f"Bumps of {ours.name} at the end of {stage.name}"
+        blocks += ratio_blocks(f"{ours.full_name}-ratios-{stage.name}", title, found)
+    return blocks
 
 
 _KINDS: Mapping[str, Callable[[Company, Experiment, Comparison], list[Block]]] = {

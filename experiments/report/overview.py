@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.resources.abc import Traversable
 
 from experiments.plans.plan import PLANS
 from experiments.report import costs, tables
-from experiments.report.document import Section, Table
+from experiments.report.document import Section, Table, table
 from experiments.report.measures import evaluated, number, of_seeds, spread
-from experiments.report.run_folder import Experiment, RunFolder
+from experiments.report.run_folder import Experiment
 
 MS_PER_H = 3.6e6
 DRIVEN = {
@@ -54,34 +54,27 @@ def _driven(experiments: Sequence[Experiment]) -> Table:
 
 def _origins(experiments: Sequence[Experiment], gpu_step_ms: float | None) -> Table:
     """What every experiment cost, and how to repeat it."""
-    header = ["experiment", "seeds", "episodes", "of one action, %", "actions", "gradient steps",
-              "hours"]  # fmt: skip
+
+    def steps(e: Experiment) -> int:
+        return sum(run.train_steps for run in e.runs)
+
+    columns: dict[str, Callable[[Experiment], str]] = {
+        "experiment": lambda e: e.full_name,
+        "seeds": lambda e: ", ".join(
+            f"{run.info.seed}{'' if run.info.complete else ' (not complete)'}" for run in e.runs
+        ),
+        "episodes": lambda e: f"{sum(len(run.episodes) for run in e.runs):,}",
+        "of one action, %": lambda e: spread(of_seeds(e, lambda r: 100.0 * r.one_action_share)),
+        "actions": lambda e: f"{sum(run.actions for run in e.runs):,}",
+        "gradient steps": lambda e: f"{steps(e):,}",
+        "hours": lambda e: f"{sum(run.info.seconds for run in e.runs) / 3600:.2f}",
+    }
     if gpu_step_ms is not None:
-        header.append(f"projected hours of gradient steps on a GPU, {gpu_step_ms:g} ms each")
-    header += ["command of the first seed", "machine", "commit"]
-    rows = [_origin(experiment, gpu_step_ms) for experiment in experiments]
-    title = "What was run, and what all seeds together cost"
-    return Table("costs", title, tuple(header), tuple(rows))
-
-
-def _origin(experiment: Experiment, gpu_step_ms: float | None) -> tuple[str, ...]:
-    runs = experiment.runs
-    steps = sum(run.train_steps for run in runs)
-    projected = () if gpu_step_ms is None else (number(steps * gpu_step_ms / MS_PER_H),)
-    return (
-        experiment.full_name,
-        ", ".join(_seed(run) for run in runs),
-        f"{sum(len(run.episodes) for run in runs):,}",
-        spread(of_seeds(experiment, lambda run: 100.0 * run.one_action_share)),
-        f"{sum(run.actions for run in runs):,}",
-        f"{steps:,}",
-        f"{sum(run.info.seconds for run in runs) / 3600:.2f}",
-        *projected,
-        f"`{experiment.first.command}`",
-        ", ".join(dict.fromkeys(run.info.machine for run in runs)),
-        ", ".join(dict.fromkeys(f"`{run.info.commit}`" for run in runs)),
-    )
-
-
-def _seed(run: RunFolder) -> str:
-    return f"{run.info.seed}" if run.info.complete else f"{run.info.seed} (not complete)"
+        title = f"projected hours of gradient steps on a GPU, {gpu_step_ms:g} ms each"
+        columns[title] = lambda e: number(steps(e) * gpu_step_ms / MS_PER_H)
+    columns |= {
+        "command of the first seed": lambda e: f"`{e.first.command}`",
+        "machine": lambda e: ", ".join(dict.fromkeys(run.info.machine for run in e.runs)),
+        "commit": lambda e: ", ".join(dict.fromkeys(f"`{run.info.commit}`" for run in e.runs)),
+    }
+    return table("costs", "What was run, and what all seeds together cost", experiments, columns)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from experiments.report.document import Table
+from experiments.report.document import Block, Findings, Missing, Picture, Table, table
 from experiments.report.figures.style import GREY, INK, label_rows, sheet, styled
 from experiments.report.measures import number
-from experiments.report.run_folder import Experiment
+from experiments.report.run_folder import Experiment, Rows, RunFolder
 from experiments.verdicts import MARGIN, Floats, Paired, holm, log_rates, paired
 
 Drives = Mapping[int, tuple[float, float]]
@@ -31,15 +32,60 @@ class Ratio:
     """Corrected for the number of comparisons."""
 
 
+def newest_drives(experiment: Experiment, world: str) -> Drives:
+    """Bumps and actions of the newest frozen drives, by seed."""
+    return _drives({run.info.seed: run.evaluated(world) for run in experiment.runs})
+
+
 def stage_drives(experiment: Experiment, stage: str, world: str) -> Drives:
     """Bumps and actions of the frozen drives at the end of a stage, by seed."""
-    found = {}
-    for run in experiment.runs:
-        rows = run.evaluated(world).where(label=f"stage {stage}")
-        if len(rows):
-            bumps, actions = rows.numbers("bumps")[-1], rows.numbers("actions")[-1]
-            found[run.info.seed] = (float(bumps), float(actions))
-    return found
+    label = f"stage {stage}"
+    runs = experiment.runs
+    return _drives({run.info.seed: run.evaluated(world).where(label=label) for run in runs})
+
+
+def drives_at_equal_actions(
+    ours: Experiment, theirs: Experiment, named: Mapping[str, Experiment], world: str
+) -> tuple[Drives, Drives]:
+    """Newest frozen drives of both, by seed, up to as many actions as the one that drove less.
+
+    Args:
+        ours: One experiment.
+        theirs: The other.
+        named: Experiments by name, among them those that the two go on from: their drives and
+            actions come before.
+        world: Where they drove frozen.
+    """
+    mine, other = (
+        {run.info.seed: _with_before(run, named, world) for run in each.runs}
+        for each in (ours, theirs)
+    )
+    for seed in mine.keys() & other.keys():
+        both = (mine[seed], other[seed])
+        end = min(rows.numbers("total_actions").max(initial=-1.0) for rows in both)
+        mine[seed], other[seed] = (
+            Rows(tuple(row for row in rows.rows if float(row["total_actions"]) <= end))
+            for rows in both
+        )
+    return _drives(mine), _drives(other)
+
+
+def _with_before(run: RunFolder, named: Mapping[str, Experiment], world: str) -> Rows:
+    """Frozen drives, predecessors' first."""
+    rows = run.evaluated(world)
+    for before in named[run.info.after].runs if run.info.after in named else ():
+        if before.info.seed == run.info.seed:
+            rows = Rows(_with_before(before, named, world).rows + rows.rows)
+    return rows
+
+
+def _drives(rows: Mapping[int, Rows]) -> Drives:
+    """Bumps and actions of each seed's last drive."""
+    return {
+        seed: (float(each.rows[-1]["bumps"]), float(each.rows[-1]["actions"]))
+        for seed, each in rows.items()
+        if len(each)
+    }
 
 
 def logs(drives: Drives, seeds: Sequence[int]) -> Floats:
@@ -75,26 +121,34 @@ def ratios(
     return [Ratio(ours, name, world, each, corrected[name]) for name, each in found.items()]
 
 
+def ratio_blocks(
+    name: str, title: str, found: Sequence[Ratio], more: Sequence[str] = ()
+) -> list[Block]:
+    """Table, sentences and figure of comparisons, or why there are none; `more` sentences."""
+    if not found:
+        return [Missing(title, "fewer than two seeds of both were run")]
+    caption = "Bumps of the first divided by those of the other, seed by seed."
+    return [
+        ratio_table(name, title, found),
+        Findings((*told(found), *more)),
+        Picture(f"{name}-figure", title, caption, partial(ratio_figure, found)),
+    ]
+
+
 def ratio_table(name: str, title: str, found: Sequence[Ratio]) -> Table:
     """One row for each comparison."""
-    header = (
-        "compared", "corridor", "seeds", "ratio of bumps", "95 % interval", "p", "verdict",
-        "seeds to decide",
-    )  # fmt: skip
-    rows = tuple(
-        (
-            f"{each.ours} / {each.theirs}",
-            each.world,
-            str(each.paired.seeds),
-            number(each.paired.ratio),
-            f"{number(each.paired.low)} to {number(each.paired.high)}",
-            f"{each.p:.3f}",
-            each.paired.verdict + ("" if each.paired.not_inferior else ", may be inferior"),
-            "-" if each.paired.verdict != "undecided" else f"about {each.paired.needed:,}",
-        )
-        for each in found
-    )
-    return Table(name, title, header, rows)
+    return table(name, title, found, {
+        "compared": lambda each: f"{each.ours} / {each.theirs}",
+        "corridor": lambda each: each.world,
+        "seeds": lambda each: str(each.paired.seeds),
+        "ratio of bumps": lambda each: number(each.paired.ratio),
+        "95 % interval": lambda each: f"{number(each.paired.low)} to {number(each.paired.high)}",
+        "p": lambda each: f"{each.p:.3f}",
+        "verdict": lambda each: each.paired.verdict
+        + ("" if each.paired.not_inferior else ", may be inferior"),
+        "seeds to decide": lambda each: f"about {each.paired.needed:,}"
+        if each.paired.verdict == "undecided" else "-",
+    })  # fmt: skip
 
 
 def told(found: Sequence[Ratio]) -> list[str]:

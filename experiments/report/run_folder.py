@@ -6,12 +6,11 @@ seed; seeds of one experiment at one scale belong together.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -20,11 +19,13 @@ from pydantic import TypeAdapter, ValidationError
 from experiments.drives import routes
 from experiments.drives.routes import Route
 from experiments.records import EVALUATION_COLUMNS, TourRecord
-from shared.errors import ConfigError, StateError
-from shared.facts import ACTION_COUNT, IMAGE_SHAPE
+from experiments.runs import probes
+from experiments.runs.probes import Probes
+from shared.errors import ConfigError, StateError, first_problem
 from shared.run_record import RUN, SERVICES, RunInfo, read_csv, read_episodes, samples_by_world
 
 Floats = npt.NDArray[np.float64]
+T = TypeVar("T")
 
 LEAST_WINDOW = 10
 """Episodes that a point of a curve averages at the smallest scale."""
@@ -69,19 +70,6 @@ class Rows:
 
 
 @dataclass(frozen=True)
-class Probes:
-    """Images of a fixed set, and what one network predicts for them."""
-
-    label: str
-    """Stage and world, or `best` and world."""
-    world: str
-    images: npt.NDArray[np.uint8]
-    """uint8 [n, 50, 75]."""
-    values: Floats
-    """float64 [n, actions]: clipped rewards of all actions."""
-
-
-@dataclass(frozen=True)
 class RunFolder:
     """One seed of an experiment, as its folder holds it."""
 
@@ -89,7 +77,8 @@ class RunFolder:
     info: RunInfo
     episodes: Rows
     evaluations: Rows
-    probes: tuple[Probes, ...]
+    probes: dict[str, Probes]
+    """What networks predict, by stage and world, or `best` and world."""
     routes: dict[str, Route]
     """The route of each drive, by its label."""
     tours: tuple[TourRecord, ...]
@@ -232,6 +221,7 @@ def _seed_folders(folders: Iterable[Path]) -> list[Path]:
 def read_run(folder: Path) -> RunFolder:
     """Read one seed. Raises StateError naming the file that is not what it should be."""
     info, episodes = read_info(folder / RUN), _rows(lambda: read_episodes(folder))
+    tours = folder / "tours.json"
     if info.scale == SERVICES:
         info = info.model_copy(update=_totals(episodes))
     return RunFolder(
@@ -239,37 +229,30 @@ def read_run(folder: Path) -> RunFolder:
         info,
         episodes,
         _rows(lambda: read_csv(folder / "evaluations.csv", EVALUATION_COLUMNS)),
-        tuple(_probes(path) for path in sorted(folder.glob("probes-*.npz"))),
-        {
-            path.stem.removeprefix("route-"): routes.read(path)
-            for path in sorted(folder.glob("route-*.npz"))
-        },
-        _tours(folder / "tours.json"),
+        {_label(path): probes.read(path) for path in sorted(folder.glob("probes-*.npz"))},
+        {_label(path): routes.read(path) for path in sorted(folder.glob("route-*.npz"))},
+        _checked(tours, _TOURS.validate_json) if tours.exists() else (),
     )
 
 
 def read_info(path: Path) -> RunInfo:
     """Read and check `run.json`. Raises StateError."""
+    return _checked(path, RunInfo.model_validate_json)
+
+
+def _checked(path: Path, check: Callable[[bytes], T]) -> T:
+    """What a file holds. Raises StateError."""
     try:
-        return RunInfo.model_validate_json(path.read_bytes())
-    except (OSError, ValidationError) as error:
-        raise StateError(f"{path}: {_first_line(error)}") from error
+        return check(path.read_bytes())
+    except OSError as error:
+        raise StateError(f"{path}: {error}") from error
+    except ValidationError as error:
+        raise StateError(f"{path}: {first_problem(error)}") from error
 
 
-def _tours(path: Path) -> tuple[TourRecord, ...]:
-    if not path.exists():
-        return ()
-    try:
-        return _TOURS.validate_json(path.read_bytes())
-    except (OSError, ValidationError) as error:
-        raise StateError(f"{path}: {_first_line(error)}") from error
-
-
-def _first_line(error: Exception) -> str:
-    if isinstance(error, ValidationError):
-        first = error.errors()[0]
-        return f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}"
-    return str(error)
+def _label(path: Path) -> str:
+    """What stands behind the kind in the name of a file."""
+    return path.stem.partition("-")[2]
 
 
 def _totals(episodes: Rows) -> dict[str, float]:
@@ -288,28 +271,3 @@ def _rows(read: Callable[[], list[dict[str, str]]]) -> Rows:
         return Rows(tuple(read()))
     except (ValueError, OSError) as error:
         raise StateError(str(error)) from error
-
-
-def _arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise StateError(f"{path}: {error}") from error
-
-
-def _probes(path: Path) -> Probes:
-    arrays = _arrays(path)
-    try:
-        images, values = arrays["images"], arrays["values"]
-        world = str(arrays["world"])
-    except KeyError as error:
-        raise StateError(f"{path}: expected an array {error}, found none") from error
-    if images.shape[1:] != IMAGE_SHAPE or images.dtype != np.uint8:
-        raise StateError(f"{path}: expected images uint8 [n, 50, 75], got {images.shape}")
-    if values.shape != (len(images), ACTION_COUNT):
-        raise StateError(
-            f"{path}: expected values [{len(images)}, {ACTION_COUNT}], got {values.shape}"
-        )
-    label = path.stem.removeprefix("probes-")
-    return Probes(label, world, images, values.astype(np.float64))

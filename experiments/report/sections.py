@@ -38,17 +38,18 @@ def section_of(experiment: Experiment, shown: Presentation) -> Section:
     return Section(experiment.full_name, title, blocks)
 
 
-def _picturing(
-    experiment: Experiment, shown: Presentation
-) -> Callable[[str, str, str, Callable[[], Figure]], Picture]:
-    """A function from kind, title, caption and drawing to a picture of this experiment."""
-
-    def picture(kind: str, title: str, caption: str, draw: Callable[[], Figure]) -> Picture:
-        theirs = shown.figures.get(kind)
-        name = f"{experiment.full_name}-{kind}"
-        return Picture(name, f"{title} ({theirs})" if theirs else title, caption, draw)
-
-    return picture
+def _picture(
+    experiment: Experiment,
+    shown: Presentation,
+    kind: str,
+    title: str,
+    caption: str,
+    draw: Callable[[], Figure],
+) -> Picture:
+    """A picture of a kind; its title names the figure of the thesis that shows the same."""
+    theirs = shown.figures.get(kind)
+    name = f"{experiment.full_name}-{kind}"
+    return Picture(name, f"{title} ({theirs})" if theirs else title, caption, draw)
 
 
 def _seeds_text(experiment: Experiment) -> str:
@@ -79,38 +80,34 @@ def _progress(experiment: Experiment, shown: Presentation) -> list[Block]:
     if all(len(run.episodes) < window for run in experiment.runs):
         why = f"every seed has fewer than {window} episodes"
         return [Missing("fitness and loss over episodes", why)]
-    picture = _picturing(experiment, shown)
+    picture = partial(_picture, experiment, shown)
     stages = stages_text(experiment.runs[0].stages)
     about = f"Fitness, averaged over {window} episodes; green: episodes that reached 500."
     if window != run_folder.WINDOW:
         about += f" The thesis averages {run_folder.WINDOW} episodes."
     caption = f"{about} {_seeds_text(experiment)} {stages}"
-    told = [*findings.fitness(experiment), *findings.first_lap(experiment)]
-    blocks = [
+    blocks: list[Block] = [
         picture("fitness", "Fitness", caption, partial(progress.fitness, experiment)),
-        *sentences(told),
+        Findings(tuple(findings.fitness(experiment))),
     ]
     if not any(len(progress.curve_of(run, "loss")[0]) for run in experiment.runs):
         return [*blocks, Missing("loss over episodes", "nothing was trained")]
     caption = f"Loss, averaged over {window} episodes. {_seeds_text(experiment)} {stages}"
-    loss = picture("loss", "Loss", caption, partial(progress.loss, experiment))
-    return [*blocks, loss, *sentences(findings.loss(experiment, shown))]
+    return [*blocks, picture("loss", "Loss", caption, partial(progress.loss, experiment))]
 
 
 def _memory(experiment: Experiment, shown: Presentation) -> list[Block]:
     if not all(len(run.episodes) for run in experiment.runs):
         return [Missing("samples in the memory", "a seed has no episodes yet")]
-    picture = _picturing(experiment, shown)
+    picture = partial(_picture, experiment, shown)
     caption = f"Samples in the replay memory by action. {_seeds_text(experiment)}"
     blocks: list[Block] = [
-        picture("memory", "Memory by action", caption, partial(memory.by_action, experiment)),
-        *sentences(findings.memory(experiment, shown.expected)),
+        picture("memory", "Memory by action", caption, partial(memory.by_action, experiment))
     ]
     if any(len(run.samples_by_world) > 1 for run in experiment.runs):
         caption = f"Samples in the replay memory by corridor. {_seeds_text(experiment)}"
         drawn = partial(memory.by_world, experiment)
         blocks.append(picture("worlds", "Memory by corridor", caption, drawn))
-        blocks += sentences(findings.worlds_in_memory(experiment, shown.expected))
     elif theirs := shown.figures.get("worlds"):
         blocks.append(Missing(f"memory by corridor ({theirs})", "samples of one corridor only"))
     return blocks
@@ -119,7 +116,7 @@ def _memory(experiment: Experiment, shown: Presentation) -> list[Block]:
 def _evaluations(experiment: Experiment, shown: Presentation) -> list[Block]:
     if not experiment.worlds:
         return [Missing("drives of the frozen network", "there are none in evaluations.csv")]
-    picture = _picturing(experiment, shown)
+    picture = partial(_picture, experiment, shown)
     blocks: list[Block] = []
     for world in experiment.worlds:
         caption = (
@@ -137,7 +134,7 @@ def _evaluations(experiment: Experiment, shown: Presentation) -> list[Block]:
 
 def _probes(experiment: Experiment, shown: Presentation) -> list[Block]:
     """What the best and the last weights predict, one figure per corridor."""
-    worlds = sorted({entry.world for run in experiment.runs for entry in run.probes})
+    worlds = sorted({entry.world for run in experiment.runs for entry in run.probes.values()})
     blocks: list[Block] = []
     for world in worlds:
         for weights, choose in (("best", probes.best), ("last", probes.last)):
@@ -154,19 +151,18 @@ def _predictions(
     experiment: Experiment, shown: Presentation, kind: str, choice: probes.Choice
 ) -> Picture:
     entry = choice.probes
-    networks = [probes.Predictions("reward", entry.values)]
-    drawn = partial(probes.predictions, entry, networks, PROBES_SHOWN)
+    drawn = partial(probes.predictions, entry, {"reward": entry.values}, PROBES_SHOWN)
     caption = (
         f"A fixed set of images of {entry.world}, and the rewards predicted for "
         f"{', '.join(probes.SHOWN)}, from −1 to 1, by seed {choice.seed}: {choice.weights}."
     )
     title = f"Predicted rewards in {entry.world}, {kind.split('-')[1]} weights"
-    return _picturing(experiment, shown)(kind, title, caption, drawn)
+    return _picture(experiment, shown, kind, title, caption, drawn)
 
 
 def _tours(experiment: Experiment) -> list[Block]:
-    told = findings.tours(experiment)
-    return [tables.tours(experiment), *sentences(told)] if told else []
+    table = tables.tours(experiment)
+    return [table] if table.rows else []
 
 
 def _routes(experiment: Experiment, shown: Presentation) -> list[Block]:
@@ -177,7 +173,7 @@ def _routes(experiment: Experiment, shown: Presentation) -> list[Block]:
             name = drive.trace.world
             events = "; ".join(f"{e.number} (action {e.action}) {e.text}" for e in drive.events)
             caption = f"Drive {label} of seed {run.info.seed} in {name}: "
-            caption += findings.drive(drive.trace, of_thesis=theirs is not None)
+            caption += findings.drive(drive.trace)
             caption += f" Numbers: {events}." if events else ""
             title = f"Route in {name} ({theirs})" if theirs else f"Route in {name}"
             world = _world(name, run.folder)

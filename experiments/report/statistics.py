@@ -12,9 +12,6 @@ Floats = npt.NDArray[np.float64]
 Curve = tuple[Floats, Floats]
 """Ascending places and the values there, float64 [n] each."""
 
-RESAMPLES = 10_000
-LEVEL = 0.95
-
 
 @dataclass(frozen=True)
 class Band:
@@ -25,20 +22,6 @@ class Band:
     median: Floats
     high: Floats
     seeds: int
-
-
-@dataclass(frozen=True)
-class Difference:
-    """Difference of two means, with an interval."""
-
-    mean: float
-    low: float
-    high: float
-
-    @property
-    def sure(self) -> bool:
-        """Whether the interval excludes 0."""
-        return self.low > 0.0 or self.high < 0.0
 
 
 def block_means(episodes: Floats, values: Floats, size: int) -> Curve:
@@ -108,24 +91,3 @@ def with_gaps(band: Band, longest: float) -> Band:
 def from_the_start(band: Band, first: float) -> Band:
     """The same band with places counted from 1 at `first`."""
     return Band(band.x - first + 1.0, band.low, band.median, band.high, band.seeds)
-
-
-def bootstrap_difference(
-    ours: Floats, theirs: Floats, draw: np.random.Generator, resamples: int = RESAMPLES
-) -> Difference:
-    """Difference of the means of two groups of seeds, and its 95 % percentile interval.
-
-    Both groups are drawn anew, with replacement, `resamples` times, first `ours` then `theirs`.
-
-    Raises:
-        ValueError: A group has fewer than two seeds: nothing can be said about its spread.
-    """
-    if min(len(ours), len(theirs)) < 2:
-        raise ValueError(f"expected at least 2 seeds each, got {len(ours)} and {len(theirs)}")
-    means = [
-        group[draw.integers(0, len(group), (resamples, len(group)))].mean(axis=1)
-        for group in (ours, theirs)
-    ]
-    outside = (1.0 - LEVEL) / 2.0
-    low, high = np.quantile(means[0] - means[1], (outside, 1.0 - outside))
-    return Difference(float(ours.mean() - theirs.mean()), float(low), float(high))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from experiments.report.document import Table
+from experiments.report.document import Table, table
 from experiments.report.measures import (
     MISSING,
     evaluated,
@@ -16,6 +16,7 @@ from experiments.report.measures import (
     spread,
 )
 from experiments.report.run_folder import Experiment, RunFolder
+from shared.run_record import MemoryRecord
 
 FIGURES = {
     "bumps_per_1000": "bumps per 1,000",
@@ -29,6 +30,7 @@ FIGURES = {
 }
 """Columns of `evaluations.csv` and what the table calls them."""
 REFERENCES = {"random": "random actions", "planner": "planner that knows the map"}
+Told = Callable[[Experiment], str]
 
 
 def frozen(experiment: Experiment, world: str) -> Table:
@@ -59,135 +61,82 @@ def _figures(run: RunFolder, world: str, driver: str) -> tuple[str, ...]:
     return tuple(number(evaluated(column, world, driver)(run)) for column in FIGURES)
 
 
+def _in_first_world(column: str) -> Told:
+    """A figure of the newest frozen drives in the world of the first stage."""
+    return lambda e: spread(of_seeds(e, evaluated(column, e.first.stages[0].world)))
+
+
 def fitness(experiments: Sequence[Experiment], scale: str, figure: str) -> Table:
     """Highest mean fitness beside that of the thesis, and frozen drives beside the fitness.
 
     Circling is shown because fitness takes it for driving. `figure` is the thesis's.
     """
-    window = experiments[0].runs[0].window
     shown = f" ({figure})" if figure else ""
-    title = f"Highest mean fitness of {window} episodes{shown}"
-    header = (
-        "variant", "episodes", "thesis (100 episodes)", "ours", "frozen: bumps per 1,000",
-        "frozen: distance", "frozen: circling", "seeds",
-    )  # fmt: skip
-    rows = tuple(
-        (
-            experiment.first.title,
-            number(len(experiment.runs[0].episodes)),
-            number(float(experiment.first.thesis.get("fitness", MISSING))),
-            spread(of_seeds(experiment, max_mean_fitness)),
-            *(
-                spread(of_seeds(experiment, evaluated(name, experiment.first.stages[0].world)))
-                for name in ("bumps_per_1000", "distance", "circling")
-            ),
-            str(len(experiment.runs)),
-        )
-        for experiment in experiments
-    )
-    return Table(f"{scale}-fitness", title, header, rows)
-
-
-def first_laps(experiments: Sequence[Experiment], scale: str) -> Table:
-    """How soon each seed of each variant drove a lap frozen, and how well all drove in the end."""
-    header = (
-        "variant", "plan", "seeds", "drove a lap", "first lap after actions", "after s",
-        "bumps per 1,000", "distance", "s in all",
-    )  # fmt: skip
-    title = f"Variants of {experiments[0].first.title}"
-    rows = tuple(_variant(experiment) for experiment in experiments)
-    return Table(f"{scale}-first-laps", title, header, rows)
-
-
-def _variant(experiment: Experiment) -> tuple[str, ...]:
-    laps = [run.info.first_lap for run in experiment.runs if run.info.first_lap]
-    soonest = (spread(np.array([lap[name] for lap in laps])) for name in ("actions", "seconds"))
-    figures = (
-        spread(of_seeds(experiment, evaluated(name, experiment.first.stages[0].world)))
-        for name in ("bumps_per_1000", "distance")
-    )
-    return (
-        experiment.first.title,
-        f"`{experiment.name}`",
-        ", ".join(str(run.info.seed) for run in experiment.runs),
-        f"{len(laps)} of {len(experiment.runs)}",
-        *soonest,
-        *figures,
-        spread(np.array([run.info.seconds for run in experiment.runs])),
-    )
+    title = f"Highest mean fitness of {experiments[0].runs[0].window} episodes{shown}"
+    return table(f"{scale}-fitness", title, experiments, {
+        "variant": lambda e: e.first.title,
+        "episodes": lambda e: number(len(e.runs[0].episodes)),
+        "thesis (100 episodes)": lambda e: number(float(e.first.thesis.get("fitness", MISSING))),
+        "ours": lambda e: spread(of_seeds(e, max_mean_fitness)),
+        "frozen: bumps per 1,000": _in_first_world("bumps_per_1000"),
+        "frozen: distance": _in_first_world("distance"),
+        "frozen: circling": _in_first_world("circling"),
+        "seeds": lambda e: str(len(e.runs)),
+    })  # fmt: skip
 
 
 def memories(experiments: Sequence[Experiment], scale: str) -> Table:
     """What memories held in the end, and how many actions were taken for each of their places."""
-    header = (
-        "experiment", "seeds", "actions for each place", "left of the filling, %",
-        "reward below 0, %", "mean reward",
-    )  # fmt: skip
-    rows = []
-    for experiment in experiments:
-        told = [
-            (run, run.info.memory)
-            for run in experiment.runs
-            if run.info.memory and len(run.episodes)
-        ]
-        if not told:
-            continue
-        turnover = [run.actions / run.episodes.numbers("capacity")[-1] for run, _ in told]
-        figures = (
-            turnover,
-            [100.0 * memory.of_fill for _, memory in told],
-            [100.0 * memory.negative for _, memory in told],
-            [memory.mean_reward for _, memory in told],
-        )
-        seeds = ", ".join(str(run.info.seed) for run, _ in told)
-        rows.append((experiment.name, seeds, *(spread(np.array(each)) for each in figures)))
-    return Table(f"{scale}-memories", "What the memories held in the end", header, tuple(rows))
+
+    def told(e: Experiment) -> list[tuple[RunFolder, MemoryRecord]]:
+        runs = [run for run in e.runs if len(run.episodes)]
+        return [(run, run.info.memory) for run in runs if run.info.memory]
+
+    def of(figure: Callable[[RunFolder, MemoryRecord], float]) -> Told:
+        return lambda e: spread(np.array([figure(*each) for each in told(e)]))
+
+    shown = [experiment for experiment in experiments if told(experiment)]
+    return table(f"{scale}-memories", "What the memories held in the end", shown, {
+        "experiment": lambda e: e.name,
+        "seeds": lambda e: ", ".join(str(run.info.seed) for run, _ in told(e)),
+        "actions for each place": of(lambda run, _: run.actions
+                                     / run.episodes.numbers("capacity")[-1]),
+        "left of the filling, %": of(lambda _, memory: 100.0 * memory.of_fill),
+        "reward below 0, %": of(lambda _, memory: 100.0 * memory.negative),
+        "mean reward": of(lambda _, memory: memory.mean_reward),
+    })  # fmt: skip
 
 
 def test_drives(experiments: Sequence[Experiment]) -> Table:
     """How the test drives of every run went, a row a run (A45)."""
-    header = (
-        "experiment", "scale", "seed", "full and without a bump", "without a bump", "bumps of each",
-    )  # fmt: skip
-    rows = tuple(
-        (
-            run.info.experiment,
-            run.info.scale,
-            str(run.info.seed),
-            f"{sum(tour.passed for tour in run.tours)} of {len(run.tours)}",
-            f"{sum(not tour.bumps for tour in run.tours)} of {len(run.tours)}",
-            ", ".join(str(tour.bumps) for tour in run.tours),
-        )
-        for experiment in experiments
-        for run in experiment.runs
-        if run.tours
-    )
-    return Table("test-drives", "Test drives (A45)", header, rows)
+    runs = [run for experiment in experiments for run in experiment.runs if run.tours]
+    return table("test-drives", "Test drives (A45)", runs, {
+        "experiment": lambda run: run.info.experiment,
+        "scale": lambda run: run.info.scale,
+        "seed": lambda run: str(run.info.seed),
+        "full and without a bump":
+            lambda run: f"{sum(tour.passed for tour in run.tours)} of {len(run.tours)}",
+        "without a bump":
+            lambda run: f"{sum(not tour.bumps for tour in run.tours)} of {len(run.tours)}",
+        "bumps of each": lambda run: ", ".join(str(tour.bumps) for tour in run.tours),
+    })  # fmt: skip
 
 
 def tours(experiment: Experiment) -> Table:
     """Every test drive of every seed (A45)."""
-    header = (
-        "seed", "drive", "full and without a bump", "actions driven", "turns on the spot", "bumps",
-        "of the route", "bridges", "past the box",
-    )  # fmt: skip
-    rows = tuple(
-        (
-            str(run.info.seed),
-            f"tour-{place}",
-            _yes(tour.passed),
-            f"{tour.driven:,}",
-            f"{tour.turned:,}",
-            str(tour.bumps),
-            f"{100 * tour.route_share:.0f} %",
-            ", ".join(tour.bridges) or "-",
-            _yes(tour.box_dropped),
-        )
-        for run in experiment.runs
-        for place, tour in enumerate(run.tours)
-    )
+    drives = [(run, *each) for run in experiment.runs for each in enumerate(run.tours)]
     title = "Test drives with turns on the spot (A45)"
-    return Table(f"{experiment.full_name}-tours", title, header, rows)
+    return table(f"{experiment.full_name}-tours", title, drives, {
+        "seed": lambda drive: str(drive[0].info.seed),
+        "drive": lambda drive: f"tour-{drive[1]}",
+        "full and without a bump": lambda drive: _yes(drive[2].passed),
+        "actions driven": lambda drive: f"{drive[2].driven:,}",
+        "turns on the spot": lambda drive: f"{drive[2].turned:,}",
+        "bumps": lambda drive: str(drive[2].bumps),
+        "of the route": lambda drive: f"{100 * drive[2].route_share:.0f} %",
+        "bridges": lambda drive: ", ".join(drive[2].bridges) or "-",
+        "past the box": lambda drive: _yes(drive[2].box_dropped),
+    })  # fmt: skip
 
 
 def _yes(holds: bool) -> str:

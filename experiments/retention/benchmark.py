@@ -13,7 +13,7 @@ from experiments.plans.scales import load_plan
 from experiments.retention.offline import Method
 from experiments.retention.refresh import Way
 from shared.config import Config, Name, Section
-from shared.errors import ConfigError
+from shared.errors import ConfigError, first_problem
 
 Count = Annotated[int, Field(ge=1)]
 Names = Annotated[tuple[Name, ...], Field(strict=False)]
@@ -111,10 +111,10 @@ def read_benchmark(text: str) -> Benchmark:
     """Return the benchmark in the text of a file. Raises ConfigError where it is wrong."""
     try:
         found = Benchmark.model_validate(tomllib.loads(text))
-    except (ValidationError, tomllib.TOMLDecodeError) as error:
-        first = error.errors()[0] if isinstance(error, ValidationError) else {"msg": str(error)}
-        where = ".".join(str(part) for part in first.get("loc", ()))
-        raise ConfigError(f"{FILE}: {where}: {first['msg']}") from error
+    except ValidationError as error:
+        raise ConfigError(f"{FILE}: {first_problem(error)}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{FILE}: {error}") from error
     for setting in found.settings:
         plan = load_plan(setting.plan, setting.scale)
         stages = {stage.name for stage in plan.stages}

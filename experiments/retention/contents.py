@@ -14,6 +14,7 @@ from shared.config import Config, Numerics
 from shared.facts import SHORT_NAMES
 from shared.rl.memory import ReplayMemory
 from shared.rl.predictor import Predictor
+from shared.rl.retention.most_alike import FAR, hamming
 from shared.rl.retention.strategy import strategy
 from shared.rl.schedule import due
 from shared.rl.turn import maintain
@@ -119,7 +120,6 @@ def _nearest_bits(mark: Mark) -> float:
     memory = mark.memory
     some = np.linspace(0, len(memory) - 1, min(len(memory), MOST_COMPARED)).astype(np.int64)
     parts = [mark.network.descriptors(images) for _, images in memory.parts(some)]
-    signs = np.unpackbits(np.concatenate(parts), axis=1).astype(np.float32) * 2.0 - 1.0
-    products = signs @ signs.T
-    np.fill_diagonal(products, -np.inf)
-    return float((signs.shape[1] - products.max(axis=1)).mean() / 2.0)
+    distances = hamming(np.concatenate(parts))(np.arange(len(some)), 0)
+    np.fill_diagonal(distances, FAR)
+    return float(distances.min(axis=1).mean())

@@ -13,7 +13,7 @@ from experiments.retention.stream import Stream
 from shared.config import Config, Numerics
 from shared.rl.memory import PART, SAMPLE, ReplayMemory
 from shared.rl.predictor import Predictor
-from shared.rl.retention.amounts import kept_in_total
+from shared.rl.retention.strategy import kept_in_total
 
 Method = Literal["k-centre", "herding"]
 """k-centre: again and again the sample farthest from all chosen ones.

@@ -12,7 +12,6 @@ import json
 import lzma
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -20,16 +19,15 @@ import numpy as np
 import typer
 from pydantic import TypeAdapter, ValidationError
 
-from experiments.report.document import Block, Findings, Missing, Picture, Section, Table
+from experiments.report.document import Block, Missing, Section, Table
 from experiments.report.measures import number
 from experiments.report.ratios import (
     Drives,
     common_seeds,
     logs,
-    ratio_figure,
+    ratio_blocks,
     ratio_table,
     ratios,
-    told,
 )
 from experiments.retention.benchmark import Benchmark, load_benchmark
 from experiments.retention.work import Measured, Network
@@ -128,18 +126,9 @@ def _verdicts(measured: Sequence[Measured], setting: str, benchmark: Benchmark) 
     }
     primary = [e.name for e in benchmark.entries if e.primary and e.name != OURS]
     found = ratios(OURS, primary, FIRST_WORLD, drives)
-    name = f"retention-{setting}"
-    if not found:
-        return [Missing(f"verdicts on RMM ({setting})", "fewer than two seeds were measured")]
     title = f"RMM beside the other primary entries in Plus, after Minus ({setting})"
-    blocks: list[Block] = [
-        ratio_table(f"{name}-verdicts", title, found),
-        Findings((*told(found), *_chance(measured), *_not_judged(measured, benchmark))),
-        Picture(
-            f"{name}-ratios", title, "Bumps of RMM divided by those of the other, seed by seed.",
-            partial(ratio_figure, found),
-        ),
-    ]  # fmt: skip
+    more = [*_chance(measured), *_not_judged(measured, benchmark)]
+    blocks = ratio_blocks(f"retention-{setting}-verdicts", title, found, more)
     explored = [e.name for e in benchmark.entries if not e.primary]
     if table := _explored(explored, drives, setting):
         blocks.append(table)

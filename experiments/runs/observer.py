@@ -93,8 +93,8 @@ class Observer:
     def take_pictures(self, label: str, world: str) -> None:
         """Save what the network predicts in `world` and in all worlds of the evaluation."""
         for each in sorted({world, *self._plan.evaluation.worlds}):
-            seen = probes.look(self._env(each).robot, self._network)
-            probes.save(self._folder / f"probes-{label}-{each}.npz", seen)
+            path = self._folder / f"probes-{label}-{each}.npz"
+            probes.take(path, self._env(each).robot, self._network)
 
     def drive_tours(self, world: str) -> None:
         """Carry out the test drives (A45); write their routes, and `tours.json` about all.

@@ -142,14 +142,12 @@ def _distinct(chains: list[list[Job]]) -> list[list[Job]]:
 
 def _results(futures: list[Future[bool]], stop: Any) -> bool:
     """Whether all are complete; the first failure stops the others and is raised."""
-    complete = True
-    for future in futures:
-        try:
-            complete &= future.result()
-        except BaseException:
-            stop.set()
-            raise
-    return complete
+    try:
+        complete = [future.result() for future in futures]
+    except BaseException:
+        stop.set()
+        raise
+    return all(complete)
 
 
 def _bars(console: Console) -> Bars:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
+from shared.inbox import Inbox
 from shared.keys import ACTOR_STATE, LEARNER_STATE, REPLAY_STATE, ROBOT_STATE, Stream
 from shared.messages import ActorState, LearnerState, Message, ReplayState, RobotState
 
-M = TypeVar("M", bound=Message)
 M_co = TypeVar("M_co", bound=Message, covariant=True)
 
 
@@ -42,28 +42,15 @@ class Snapshot:
         return sum(seen.message.actions_per_s for seen in self.actors.values())
 
 
-class Source(Protocol):
-    """What the reader needs of an inbox."""
-
-    def subscribe(self, stream: Stream, ident: str = "*") -> None:
-        """Keep the newest message of every sender."""
-
-    def take(self, stream: Stream, cls: type[M]) -> list[tuple[str, M]]:
-        """The newest unread messages by sender."""
-
-
 class Reader:
     """Gathers heartbeats from an inbox. `update` often; `snapshot` when something is shown."""
 
     def __init__(
-        self, inbox: Source, clock: Callable[[], float] = time.monotonic, robot: str = "*"
+        self, inbox: Inbox, clock: Callable[[], float] = time.monotonic, robot: str = "*"
     ) -> None:
         """Listen to all robots, or to one: a driver's credentials allow no more."""
         self._inbox, self._clock = inbox, clock
-        self._robots: dict[str, tuple[RobotState, float]] = {}
-        self._actors: dict[str, tuple[ActorState, float]] = {}
-        self._replay: tuple[ReplayState, float] | None = None
-        self._learner: tuple[LearnerState, float] | None = None
+        self._newest: dict[Stream, dict[str, tuple[Message, float]]] = {}
         inbox.subscribe(ROBOT_STATE, robot)
         for stream in (ACTOR_STATE, REPLAY_STATE, LEARNER_STATE):
             inbox.subscribe(stream)
@@ -71,25 +58,21 @@ class Reader:
     def update(self) -> None:
         """Take what has arrived."""
         now_s = self._clock()
-        for sender, robot in self._inbox.take(ROBOT_STATE, RobotState):
-            self._robots[sender] = (robot, now_s)
-        for sender, actor in self._inbox.take(ACTOR_STATE, ActorState):
-            self._actors[sender] = (actor, now_s)
-        for _, replay in self._inbox.take(REPLAY_STATE, ReplayState):
-            self._replay = (replay, now_s)
-        for _, learner in self._inbox.take(LEARNER_STATE, LearnerState):
-            self._learner = (learner, now_s)
+        for stream in (ROBOT_STATE, ACTOR_STATE, REPLAY_STATE, LEARNER_STATE):
+            newest = self._newest.setdefault(stream, {})
+            newest.update((who, (m, now_s)) for who, m in self._inbox.take(stream, stream.request))
 
     def snapshot(self) -> Snapshot:
         """The newest of everything, with its age now."""
         now_s = self._clock()
 
-        def seen(pair: tuple[M, float]) -> Seen[M]:
-            return Seen(pair[0], now_s - pair[1])
+        def seen(stream: Stream) -> dict[str, Seen[Any]]:
+            newest = sorted(self._newest.get(stream, {}).items())
+            return {name: Seen(message, now_s - at_s) for name, (message, at_s) in newest}
 
         return Snapshot(
-            robots={name: seen(pair) for name, pair in sorted(self._robots.items())},
-            actors={name: seen(pair) for name, pair in sorted(self._actors.items())},
-            replay=seen(self._replay) if self._replay else None,
-            learner=seen(self._learner) if self._learner else None,
+            robots=seen(ROBOT_STATE),
+            actors=seen(ACTOR_STATE),
+            replay=next(iter(seen(REPLAY_STATE).values()), None),
+            learner=next(iter(seen(LEARNER_STATE).values()), None),
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -14,9 +14,8 @@ from pydantic import ValidationError
 
 from services.processes import DRIVER, SERVICES
 from shared.bus import Bus
-from shared.codec import first_problem
 from shared.config import Config
-from shared.errors import BadMessage, BusError, ConfigError, PeerMissing
+from shared.errors import BadMessage, BusError, ConfigError, PeerMissing, first_problem
 from shared.facts import NAME
 from shared.halts.book import ALL
 from shared.halts.orders import RobotOrder, order
@@ -55,11 +54,8 @@ def command_robots(
     """
     _check_name(robot)
     with Bus(config.bus, config.run.name) as bus, interruptible() as ended:
-        return (
-            0
-            if order(bus, name, robot or ALL, typer.echo, number=number, ended=ended.is_set)
-            else 1
-        )
+        obeyed = order(bus, name, robot or ALL, typer.echo, number=number, ended=ended.is_set)
+    return 0 if obeyed else 1
 
 
 @contextmanager
@@ -101,22 +97,6 @@ def change_world(config: Config, robot: str | None, **change: Any) -> int:
     except ValidationError as error:
         raise ConfigError(f"{change['kind']}: {first_problem(error)}") from error
 
-    def tell(bus: Bus, name: str) -> bool:
-        answer = _ask(bus, ROBOT_WORLD, message, WorldChanged, name)
-        if not answer.accepted:
-            typer.echo(f"{name}: refused: {answer.reason}", err=True)
-            return False
-        boxes = f"obstacles {', '.join(answer.obstacles)}" if answer.obstacles else "no obstacles"
-        typer.echo(f"{name}: world {answer.world}, {boxes}, {answer.pending} changes waiting")
-        return True
-
-    return _tell_robots(config, change["kind"], robot, tell)
-
-
-def _tell_robots(
-    config: Config, what: str, robot: str | None, tell: Callable[[Bus, str], bool]
-) -> int:
-    """Tell one robot or all of the run something; 1 if `tell` was not obeyed or not answered."""
     _check_name(robot)
     with Bus(config.bus, config.run.name) as bus:
         present = sorted({peer.id for peer in bus.peers(DRIVER.name)})
@@ -125,14 +105,23 @@ def _tell_robots(
             raise PeerMissing(
                 f"no robot of run {config.run.name!r} answers at {config.bus.endpoint}"
             )
-        failed = 0
-        for name in names:
-            try:
-                failed += not tell(bus, name)
-            except (BusError, BadMessage) as error:
-                failed += 1
-                typer.echo(f"{name}: no answer to {what}: {error}", err=True)
-    return 1 if failed else 0
+        done = [_change_world(bus, name, message) for name in names]
+        return 0 if all(done) else 1
+
+
+def _change_world(bus: Bus, name: str, message: WorldChange) -> bool:
+    """Tell one robot of a wish and print its answer; whether it accepted."""
+    try:
+        answer = _ask(bus, ROBOT_WORLD, message, WorldChanged, name)
+    except (BusError, BadMessage) as error:
+        typer.echo(f"{name}: no answer to {message.kind}: {error}", err=True)
+        return False
+    if not answer.accepted:
+        typer.echo(f"{name}: refused: {answer.reason}", err=True)
+        return False
+    boxes = f"obstacles {', '.join(answer.obstacles)}" if answer.obstacles else "no obstacles"
+    typer.echo(f"{name}: world {answer.world}, {boxes}, {answer.pending} changes waiting")
+    return True
 
 
 def stop_services(config: Config, services: Sequence[str]) -> int:

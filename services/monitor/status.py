@@ -87,15 +87,9 @@ def as_dict(config: Config, entries: Sequence[Entry], snapshot: Snapshot) -> dic
         "endpoint": config.bus.endpoint,
         "services": [
             {
-                "service": entry.peer.service,
-                "id": entry.peer.id,
-                "life": entry.peer.life,
-                "protocol": entry.peer.protocol,
-                "config": entry.peer.config,
+                **vars(entry.peer),
                 "answers": entry.reply is not None,
-                "pid": entry.reply.pid if entry.reply else None,
-                "version": entry.reply.version if entry.reply else None,
-                "uptime_s": entry.reply.uptime_s if entry.reply else None,
+                **{key: getattr(entry.reply, key, None) for key in ("pid", "version", "uptime_s")},
             }
             for entry in entries
         ],
@@ -113,11 +107,10 @@ def report(
     title = f"run {config.run.name} at {config.bus.endpoint}"
     if not entries:
         return f"{title}: no service is alive"
-    parts: list[RenderableType] = [_services(title, entries, narrow)]
     facts = Table.grid(padding=(0, 2))
     for row in _facts(snapshot):
         facts.add_row(*row)
-    return Group(*parts, facts) if facts.row_count else Group(*parts)
+    return Group(_services(title, entries, narrow), *([facts] if facts.row_count else []))
 
 
 def _services(title: str, entries: Sequence[Entry], narrow: bool) -> Table:

@@ -92,8 +92,7 @@ def compare(recording: Recording) -> Comparison:
     networks = _Networks(recording)
     found = Comparison()
     seen: OrderedDict[Place, Observation] = OrderedDict()
-    for recorded in recording.messages():
-        message = recorded.message
+    for message in recording.messages():
         if isinstance(message, Observation):
             place = (message.robot, message.life, message.sequence, message.attempt)
             seen[place] = message
@@ -174,7 +173,7 @@ class _Networks:
         if version not in self._recording.weights:
             return None
         if version not in self._ready:
-            data = self._recording.load(self._recording.weights[version])
+            data = self._recording.load(version)
             try:
                 self._ready[version] = self._none.successor(version, data)
             except ValueError as error:

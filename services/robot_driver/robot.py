@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 from shared.messages import ImageArray
 
 if TYPE_CHECKING:
-    from services.robot_driver.simulated.world import Obstacle, World
+    from services.robot_driver.simulated.world import World
+    from services.robot_driver.simulated.world_parts import Obstacle
 
 
 @dataclass(frozen=True)

@@ -15,15 +15,10 @@ from typing import Any
 from pydantic import ValidationError
 
 from services.robot_driver.robot import ChangeableWorld
-from services.robot_driver.simulated.world import (
-    MAX_OBSTACLES,
-    Obstacle,
-    World,
-    WorldError,
-    load_world,
-)
-from shared.codec import decode, encode, first_problem
-from shared.errors import BadMessage
+from services.robot_driver.simulated.world import World, WorldError, load_world
+from services.robot_driver.simulated.world_parts import Obstacle
+from shared.codec import decode, encode
+from shared.errors import BadMessage, first_problem
 from shared.messages import Box, WorldChange, WorldChanged
 
 MAX_PENDING = 64
@@ -155,20 +150,11 @@ class WorldChanges:
                 break
             world, names = _after(earlier, world, names)
         if change.box is not None:
-            if change.box.name in names:
-                raise ValueError(f"there is already an obstacle {change.box.name!r}")
-            if len(names) >= MAX_OBSTACLES:
-                raise ValueError(f"there are {MAX_OBSTACLES} obstacles already")
-            world.check_obstacle(obstacle_of(change.box))
+            world.check_placing(obstacle_of(change.box), names)
         elif change.name is not None and change.name not in names:
             raise ValueError(f"there is no obstacle {change.name!r}")
         elif change.world is not None:
-            starts = len(_world(change.world).starts)
-            if change.start >= starts:
-                raise ValueError(
-                    f"world {change.world!r}: expected a start from 0 to {starts - 1}, "
-                    f"got {change.start}"
-                )
+            _world(change.world).check_start(change.start)
 
     def _refusal(self, change: WorldChange) -> str:
         """Carry out one change; return why not, if so."""

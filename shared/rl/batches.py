@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -35,15 +35,8 @@ class Batch(NamedTuple):
         return Batch(images, actions, self.rewards)
 
 
-class Batches(Protocol):
-    """Where mini-batches come from."""
-
-    def take(self, ranks: Ranks) -> Batch:
-        """The samples at these ranks, on the device that trains."""
-
-
-class StoredBatches:
-    """Gathered from the store, copied to the device."""
+class Batches:
+    """Mini-batches gathered from the store, copied to the device that trains."""
 
     def __init__(self, samples: SampleStore, device: str) -> None:
         self._samples, self._device = samples, device
@@ -58,12 +51,12 @@ class StoredBatches:
         )
 
 
-class ResidentBatches:
+class ResidentBatches(Batches):
     """All samples on the device, images as uint8, so that gathering never waits for the host."""
 
     def __init__(self, samples: SampleStore, device: str) -> None:
-        everything = np.arange(len(samples), dtype=np.int64)
-        self._all, self._device = StoredBatches(samples, device).take(everything), device
+        super().__init__(samples, device)
+        self._all = super().take(np.arange(len(samples), dtype=np.int64))
 
     def take(self, ranks: Ranks) -> Batch:
         """Copies of the samples at these ranks, made on the device."""

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from shared.rl import trunk
-from shared.rl.batches import Batches, Mask, Ranks, ResidentBatches, StoredBatches
+from shared.rl.batches import Batches, Mask, Ranks, ResidentBatches
 from shared.rl.engine import arithmetic, scaled
 from shared.rl.memory import SampleStore
 from shared.rl.network import QNetwork
@@ -40,7 +40,7 @@ class Gradients:
 
     def stored(self, samples: SampleStore) -> Batches:
         """Mini-batches gathered from the store one by one."""
-        return StoredBatches(samples, self._numerics.device)
+        return Batches(samples, self._numerics.device)
 
     def of_fit(self, samples: SampleStore) -> Batches:
         """Mini-batches of a fitting phase; on a device not waited for, all at once."""

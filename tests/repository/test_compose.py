@@ -165,7 +165,7 @@ def test_an_image_holds_what_its_service_imports(name: str) -> None:
 
 
 def test_a_preset_needs_no_library_of_experiments() -> None:
-    foreign = [*FOREIGN.values(), "gymnasium", "matplotlib", "jinja2"]
+    foreign = [*FOREIGN.values(), "gymnasium", "matplotlib"]
     code = (
         f"import sys; sys.modules.update(dict.fromkeys({foreign})); "
         "from shared import settings; settings.load('demo'); import services.robot_driver.service"

@@ -1,8 +1,8 @@
-"""Drives of frozen networks: curves over actions, and differences between experiments."""
+"""Drives of frozen networks: curves over actions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,37 +10,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from experiments.report.figures.style import (
-    GREY,
-    INK,
-    colours,
-    draw_band,
-    label_rows,
-    sheet,
-    styled,
-)
+from experiments.report.figures.style import GREY, colours, draw_band, sheet, styled
 from experiments.report.run_folder import Experiment, Floats, Rows
-from experiments.report.statistics import Band, Difference, band_between
+from experiments.report.statistics import Curve, band_between
 
 REFERENCES = {"random": ":", "planner": "--"}
 """Line styles of the floor and the ceiling."""
-
-
-def laps(rows: Rows) -> Floats:
-    """Laps per 1,000 actions, in either direction."""
-    return rows.numbers("laps_left_per_1000") + rows.numbers("laps_right_per_1000")
-
-
-def _bumps(rows: Rows) -> Floats:
-    return rows.numbers("bumps_per_1000")
-
-
-def _distance(rows: Rows) -> Floats:
-    return rows.numbers("distance")
-
-
-def _coverage(rows: Rows) -> Floats:
-    return rows.numbers("coverage")
 
 
 @dataclass(frozen=True)
@@ -48,52 +23,40 @@ class Panel:
     """One of the figures side by side."""
 
     title: str
-    of: Callable[[Rows], Floats]
+    columns: tuple[str, ...]
+    """Columns of `evaluations.csv` whose sum is shown."""
     logarithmic: bool = False
 
+    def of(self, rows: Rows) -> Floats:
+        """The figure of every drive."""
+        return np.asarray(np.sum([rows.numbers(column) for column in self.columns], axis=0))
 
-BUMPS = Panel("bumps per 1,000 actions", _bumps, logarithmic=True)
-LAPS = Panel("laps per 1,000 actions", laps)
-COVERAGE = Panel("part of the corridor visited", _coverage)
-DISTANCE = Panel("way from 50 actions ago\n(1: the farthest possible)", _distance)
+
+BUMPS = Panel("bumps per 1,000 actions", ("bumps_per_1000",), logarithmic=True)
+LAPS = Panel("laps per 1,000 actions", ("laps_left_per_1000", "laps_right_per_1000"))
+COVERAGE = Panel("part of the corridor visited", ("coverage",))
+DISTANCE = Panel("way from 50 actions ago\n(1: the farthest possible)", ("distance",))
 
 
 def panels(experiments: Sequence[Experiment], world: str) -> tuple[Panel, Panel, Panel]:
     """Bumps, whether it gets around, and how far: coverage where nobody drove a lap."""
     rows = [run.evaluations.where(world=world) for e in experiments for run in e.runs]
-    around = LAPS if any(np.any(laps(part) > 0) for part in rows) else COVERAGE
+    around = LAPS if any(np.any(LAPS.of(part) > 0) for part in rows) else COVERAGE
     return BUMPS, around, DISTANCE
 
 
-def evaluation_curves(
-    experiment: Experiment, world: str, panel: Panel
-) -> list[tuple[Floats, Floats]]:
-    """One figure of every seed that drove over the actions driven while learning."""
-    rows = [run.evaluated(world) for run in experiment.runs]
-    return [_unique(part.numbers("total_actions"), panel.of(part)) for part in rows if len(part)]
+def _curves_of(experiment: Experiment, world: str, panel: Panel) -> list[Curve]:
+    """One figure of every seed that drove, over the actions driven while learning.
 
-
-def evaluation_band(experiment: Experiment, world: str, panel: Panel) -> Band | None:
-    """The curves of all seeds together, where all of them drove; None without drives."""
-    curves = evaluation_curves(experiment, world, panel)
-    return band_between(curves) if curves else None
-
-
-def _unique(x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """The last of several drives after the same number of actions."""
-    last = np.append(x[1:] != x[:-1], True)
-    return x[last], y[last]
-
-
-def reference(experiments: Sequence[Experiment], driver: str, world: str, panel: Panel) -> float:
-    """Median over all seeds of what a driver without a network reaches; NaN if none drove."""
-    values = [
-        value
-        for experiment in experiments
-        for run in experiment.runs
-        for value in panel.of(run.evaluations.where(driver=driver, world=world))
-    ]
-    return float(np.median(values)) if values else float("nan")
+    Of several drives after the same number of actions the last one counts.
+    """
+    found = []
+    for rows in (run.evaluated(world) for run in experiment.runs):
+        if len(rows):
+            x, y = rows.numbers("total_actions"), panel.of(rows)
+            last = np.append(x[1:] != x[:-1], True)
+            found.append((x[last], y[last]))
+    return found
 
 
 @styled
@@ -105,15 +68,18 @@ def curves(experiments: Sequence[Experiment], world: str) -> Figure:
     for panel, axes in zip(panels(experiments, world), row, strict=True):
         for experiment in experiments:
             # Seeds drive different numbers of actions: single ones go on beyond the band.
-            for curve in evaluation_curves(experiment, world, panel):
+            found = _curves_of(experiment, world, panel)
+            for curve in found:
                 axes.plot(*curve, color=named[experiment.name], linewidth=0.7, alpha=0.6)
-            band = evaluation_band(experiment, world, panel)
-            if band is not None:
-                draw_band(axes, band, named[experiment.name], experiment.name)
+            if found:
+                draw_band(axes, band_between(found), named[experiment.name], experiment.name)
         for driver, style in REFERENCES.items():
-            height = reference(experiments, driver, world, panel)
-            if not np.isnan(height):
-                axes.axhline(height, color=GREY, linestyle=style, linewidth=1.1, label=driver)
+            drives = (r.evaluations.where(driver=driver, world=world) for e in experiments
+                      for r in e.runs)  # fmt: skip
+            heights = np.concatenate([panel.of(rows) for rows in drives])
+            if len(heights):
+                middle = float(np.median(heights))
+                axes.axhline(middle, color=GREY, linestyle=style, linewidth=1.1, label=driver)
         _panel(axes, panel)
     figure.legend(*row[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure
@@ -129,30 +95,3 @@ def _panel(axes: Axes, panel: Panel) -> None:
         axes.set_yticks([0, 1, 3, 10, 30, 100], ["0", "1", "3", "10", "30", "100"])
         axes.minorticks_off()
     axes.set_ylim(bottom=0)
-
-
-@dataclass(frozen=True)
-class Compared:
-    """Two experiments and the difference of their bumps per 1,000 actions in a corridor."""
-
-    ours: str
-    theirs: str
-    world: str
-    seeds: tuple[int, int]
-    difference: Difference
-
-
-@styled
-def differences(pairs: Sequence[Compared]) -> Figure:
-    """A line per pair: the difference and its interval, filled where it excludes 0."""
-    figure = sheet(0.9 + 0.32 * len(pairs))
-    axes = figure.subplots()
-    for row, pair in enumerate(pairs):
-        at, colour = len(pairs) - 1 - row, INK
-        axes.plot([pair.difference.low, pair.difference.high], [at, at], color=colour)
-        face = colour if pair.difference.sure else "white"
-        axes.plot(pair.difference.mean, at, "o", color=colour, markerfacecolor=face)
-    axes.axvline(0.0, color=GREY, linestyle="--", linewidth=1.0)
-    label_rows(axes, [f"{pair.ours} − {pair.theirs} ({pair.world})" for pair in pairs])
-    axes.set_xlabel("difference in bumps per 1,000 actions, 95 % interval")
-    return figure

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import string
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from experiments.report.figures.style import ACTION_COLOURS, GREY, INK, sheet, styled
-from experiments.report.run_folder import Experiment, Floats, Probes
+from experiments.report.run_folder import Experiment, Floats
+from experiments.runs.probes import Probes
 from shared.facts import ACTION_COUNT, ACTIONS, SHORT_NAMES
 
 COLUMNS = 6
@@ -22,22 +23,14 @@ ORDER = sorted(range(ACTION_COUNT), key=lambda index: -ACTIONS[index].turn)
 SHOWN = [SHORT_NAMES[index] for index in ORDER]
 
 
-@dataclass(frozen=True)
-class Predictions:
-    """What one network predicts for the images of a set."""
-
-    title: str
-    values: Floats
-
-
 def chosen(count: int, wanted: int) -> list[int]:
     """Indices spread evenly over a set of images, in its order."""
     return sorted({round(i) for i in np.linspace(0, count - 1, min(count, wanted))})
 
 
 @styled
-def predictions(probes: Probes, networks: Sequence[Predictions], wanted: int) -> Figure:
-    """Up to `wanted` images, below each the rewards by every network, one row of bars each."""
+def predictions(probes: Probes, networks: Mapping[str, Floats], wanted: int) -> Figure:
+    """Up to `wanted` images, below each what every network predicts, one row of bars each."""
     indices = chosen(len(probes.images), wanted)
     blocks = -(-len(indices) // COLUMNS)
     rows = 1 + len(networks)
@@ -52,8 +45,8 @@ def predictions(probes: Probes, networks: Sequence[Predictions], wanted: int) ->
                 axes.set_axis_off()
             continue
         _image(cells[0], probes.images[indices[cell]], string.ascii_lowercase[cell])
-        for axes, network in zip(cells[1:], networks, strict=True):
-            _bars(axes, network.values[indices[cell]], network.title if column == 0 else None)
+        for axes, (title, values) in zip(cells[1:], networks.items(), strict=True):
+            _bars(axes, values[indices[cell]], title if column == 0 else None)
     handles = [Patch(color=ACTION_COLOURS[name]) for name in SHOWN]
     figure.legend(handles, SHOWN, loc="outside lower center", ncols=ACTION_COUNT)
     return figure
@@ -99,9 +92,8 @@ class Choice:
 def last(experiment: Experiment, world: str) -> Choice | None:
     """Predictions at the end of the newest stage, of the lowest seed that has them."""
     for run in experiment.runs:
-        labelled = {probes.label: probes for probes in run.probes}
         for stage in reversed(run.info.stages):
-            if found := labelled.get(f"{stage.name}-{world}"):
+            if found := run.probes.get(f"{stage.name}-{world}"):
                 return Choice(run.info.seed, f"weights at the end of stage {stage.name}", found)
     return None
 
@@ -109,9 +101,8 @@ def last(experiment: Experiment, world: str) -> Choice | None:
 def best(experiment: Experiment, world: str) -> Choice | None:
     """Predictions by the weights of the longest way without a bump, of the lowest seed."""
     for run in experiment.runs:
-        for probes in run.probes:
-            if probes.label == f"best-{world}":
-                return Choice(run.info.seed, "best weights", probes)
+        if found := run.probes.get(f"best-{world}"):
+            return Choice(run.info.seed, "best weights", found)
     return None
 
 

@@ -17,7 +17,8 @@ import numpy.typing as npt
 from services.robot_driver.atlas.action_geometry import CONTACT_M, ActionGeometry
 from services.robot_driver.simulated.scene import WALL_THICKNESS_M
 from services.robot_driver.simulated.sim import SUBSTEP_M
-from services.robot_driver.simulated.world import Fixture, Floats, World
+from services.robot_driver.simulated.world import World
+from services.robot_driver.simulated.world_parts import Fixture, Floats, inside
 
 CELL_M = 0.02
 """Grid distance of the search for what can be reached: narrower differences are not seen."""
@@ -79,28 +80,19 @@ def _crossings(world: World) -> list[str]:
 def _misplaced(world: World) -> list[str]:
     """Islands that do not lie in the corridor, and a lap centre that lies on none."""
     lines = []
-    loops = [np.array(wall.points, np.float64) for wall in world.walls]
-    for i, island in enumerate(loops[1:], start=1):
-        name = world.walls[i].name
-        if not _inside(loops[0], island[0]):
-            lines.append(f"walls: island {name!r} lies outside the boundary")
-        for k, other in enumerate(loops[1:], start=1):
-            if k != i and _inside(other, island[0]):
-                lines.append(f"walls: island {name!r} lies inside {world.walls[k].name!r}")
+    boundary, *islands = world.walls
+    for island in islands:
+        corner = np.array(island.points[:1], np.float64)
+        if not inside(boundary.segments, corner)[0]:
+            lines.append(f"walls: island {island.name!r} lies outside the boundary")
+        for other in islands:
+            if other is not island and inside(other.segments, corner)[0]:
+                lines.append(f"walls: island {island.name!r} lies inside {other.name!r}")
     if world.lap is not None:
-        centre = np.array(world.lap.centre)
-        if not any(_inside(island, centre) for island in loops[1:]):
+        centre = np.array([world.lap.centre])
+        if not any(inside(island.segments, centre)[0] for island in islands):
             lines.append("lap.centre: lies on no island, so nothing can be driven round")
     return lines
-
-
-def _inside(loop: Floats, point: Floats) -> bool:
-    """Whether a point lies in a polygon float64 [n, 2]."""
-    (ax, ay), (bx, by) = loop.T, np.roll(loop, -1, axis=0).T
-    spans = (ay > point[1]) != (by > point[1])
-    rise = np.where(spans, by - ay, 1.0)
-    crosses = spans & (point[0] < ax + (point[1] - ay) / rise * (bx - ax))
-    return int(np.count_nonzero(crosses)) % 2 == 1
 
 
 def _pairs(world: World) -> _Pairs:

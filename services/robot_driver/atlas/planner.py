@@ -19,6 +19,7 @@ import numpy.typing as npt
 from services.robot_driver.atlas.action_geometry import CONTACT_M, ActionGeometry, Floats
 from services.robot_driver.atlas.pose_grid import PoseGrid, Table
 from services.robot_driver.simulated.world import World
+from services.robot_driver.simulated.world_parts import Route
 from shared.facts import ACTION_COUNT
 
 Ints = npt.NDArray[np.int64]
@@ -129,15 +130,13 @@ class Planner:
         Raises:
             ValueError: The world has no route.
         """
-        track = self._track()
-        (x, y), (ahead_x, ahead_y) = track.points[:2]
+        route = self._route
+        (x, y), (ahead_x, ahead_y) = route.points[:2]
         pose = np.array([x, y, math.atan2(ahead_y - y, ahead_x - x)])
 
-        near_end_m = track.length_m - _ARRIVAL_M
-
         def advanced(before: Floats, after: Floats) -> Floats:
-            gain = track.along(after) - track.along(before)
-            arrived = track.along(after) > near_end_m
+            along = self.progress(after)
+            gain, arrived = along - self.progress(before), along > route.length_m - _ARRIVAL_M
             follows = np.abs(gain) <= _CORNER_M
             return np.where(follows, gain + _ARRIVAL_GAIN * arrived, -np.inf)
 
@@ -146,10 +145,19 @@ class Planner:
     def progress(self, poses: Floats) -> Floats:
         """How far along the world's route poses float64 [n, 3] are, metres, float64 [n].
 
+        It is the way from the first point to the place closest to each pose.
+
         Raises:
             ValueError: The world has no route.
         """
-        return self._track().along(poses)
+        points = np.array(self._route.points, np.float64)
+        start, legs = points[:-1], np.diff(points, axis=0)
+        lengths = np.hypot(*legs.T)
+        offset = poses[:, None, :2] - start
+        part = np.clip(np.einsum("nlj,lj->nl", offset, legs) / lengths**2, 0.0, 1.0)
+        leg = np.hypot(*(offset - part[..., None] * legs).transpose(2, 0, 1)).argmin(axis=1)
+        before = np.concatenate([[0.0], np.cumsum(lengths)])
+        return np.asarray(before[leg] + part[np.arange(len(poses)), leg] * lengths[leg])
 
     def winding(self, poses: Floats) -> Floats:
         """Net angle round the lap centre along float64 [steps, 3], radians, float64 [steps].
@@ -239,39 +247,17 @@ class Planner:
             table = np.maximum(np.maximum.reduce(best), np.float32(_LOST))
         return table
 
-    def _track(self) -> _Track:
+    @property
+    def _route(self) -> Route:
         if self.world.route is None:
             raise ValueError(f"world {self.world.name!r} has no route")
-        return _Track(np.array(self.world.route.points, np.float64))
+        return self.world.route
 
     def _bearing(self, poses: Floats) -> Floats:
         if self.world.lap is None:
             raise ValueError(f"world {self.world.name!r} has no lap centre")
         cx, cy = self.world.lap.centre
         return np.asarray(np.arctan2(poses[:, 1] - cy, poses[:, 0] - cx))
-
-
-@dataclass(frozen=True)
-class _Track:
-    """A line of straight legs between points float64 [n, 2]."""
-
-    points: Floats
-
-    @property
-    def length_m(self) -> float:
-        """Length of all legs."""
-        return float(np.hypot(*np.diff(self.points, axis=0).T).sum())
-
-    def along(self, poses: Floats) -> Floats:
-        """Way from the first point to the place closest to each pose, float64 [n], metres."""
-        start, legs = self.points[:-1], np.diff(self.points, axis=0)
-        lengths = np.hypot(*legs.T)
-        offset = poses[:, None, :2] - start
-        part = np.clip(np.einsum("nlj,lj->nl", offset, legs) / lengths**2, 0.0, 1.0)
-        gaps = np.hypot(*(offset - part[..., None] * legs).transpose(2, 0, 1))
-        leg = gaps.argmin(axis=1)
-        before = np.concatenate([[0.0], np.cumsum(lengths)])
-        return np.asarray(before[leg] + part[np.arange(len(poses)), leg] * lengths[leg])
 
 
 def _wrap(angle_rad: Floats) -> Floats:

@@ -6,8 +6,6 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,13 +16,10 @@ from services.robot_driver.atlas.action_geometry import TURNS, ActionGeometry
 from services.robot_driver.atlas.inspection import problems
 from services.robot_driver.atlas.planner import Planner
 from services.robot_driver.recovery import back_off
-from services.robot_driver.robot import Pose, Velocity
+from services.robot_driver.robot import Velocity
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import World, WorldError, read_world
 from shared.config import Config
-from shared.facts import IMAGE_HEIGHT, IMAGE_WIDTH
-
-__all__ = ["RandomDrive", "corridor_width", "drive_randomly", "problems_in", "survey"]
 
 Figures = dict[str, float | int | str | bool]
 
@@ -49,8 +44,6 @@ class RandomDrive:
     """[n, 3]: x, y, heading after each recovery."""
     retreats_m: npt.NDArray[np.float64]
     """[n]: way won by each recovery."""
-    physics_s: float
-    """Mean time that simulating one action took, without the camera."""
 
 
 def problems_in(path: Path, config: Config) -> list[str]:
@@ -66,14 +59,12 @@ def survey(config: Config, world: World) -> Figures:
     """Measure the configured robot in a world, about a minute for each hundred square metres.
 
     Returns:
-        Named figures: lengths in metres, angles in degrees, times in milliseconds.
-
+        Named figures: lengths in metres, angles in degrees.
     """
     geometry = ActionGeometry.of(config.robot)
     robot = SimRobot(config.robot, world, config.run.seed)
     try:
         driven = drive_randomly(robot, _RECOVERIES, config.run.seed)
-        pictures = _render_times(robot)
     finally:
         robot.close()
     planner = Planner(world, geometry, horizon=PLANNED_ACTIONS)
@@ -85,8 +76,6 @@ def survey(config: Config, world: World) -> Figures:
         **_tour(world, geometry),
         **_random_figures(driven),
         **_saved(planner, driven),
-        **pictures,
-        "physics_ms": driven.physics_s * 1e3,
     }
 
 
@@ -98,20 +87,17 @@ def drive_randomly(robot: SimRobot, bumps: int, seed: int) -> RandomDrive:
     runs: list[int] = []
     poses: list[tuple[float, float, float]] = []
     retreats: list[float] = []
-    actions = done = 0
-    spent = 0.0
+    actions = 0
     while len(runs) < bumps:
         robot.drive(Velocity(config.speed_m_s, 0.0, turns[int(draw.integers(3))]))
-        began = time.perf_counter()
-        bumped = robot.run(config.period_s, stop_on_contact=True)
-        spent += time.perf_counter() - began
-        actions, done = actions + 1, done + 1
-        if bumped:
-            runs.append(actions - 1)
+        if robot.run(config.period_s, stop_on_contact=True):
+            runs.append(actions)
             actions = 0
             retreats.append(back_off(robot, config, float(draw.uniform(-math.pi, math.pi))))
             poses.append((robot.pose.x_m, robot.pose.y_m, robot.pose.heading_rad))
-    return RandomDrive(np.array(runs), np.array(poses), np.array(retreats), spent / done)
+        else:
+            actions += 1
+    return RandomDrive(np.array(runs), np.array(poses), np.array(retreats))
 
 
 def corridor_width(world: World) -> float:
@@ -234,22 +220,3 @@ def _saved(planner: Planner, driven: RandomDrive) -> Figures:
         ),
         "best_fitness_after_recovery_mean": float(survived.mean()),
     }
-
-
-def _render_times(robot: SimRobot, repeats: int = 100) -> Figures:
-    start = robot.world.starts[0]
-
-    def look(width: int, height: int) -> Callable[[int], object]:
-        return lambda i: robot.look_from(Pose(start.x_m, start.y_m, float(i)), width, height)
-
-    return {
-        f"render_{width}x{height}_ms": _mean_ms(look(width, height), repeats)
-        for width, height in ((IMAGE_WIDTH, IMAGE_HEIGHT), (2 * IMAGE_WIDTH, 2 * IMAGE_HEIGHT))
-    }
-
-
-def _mean_ms(work: Callable[[int], object], repeats: int) -> float:
-    began = time.perf_counter()
-    for i in range(repeats):
-        work(i)
-    return (time.perf_counter() - began) / repeats * 1e3

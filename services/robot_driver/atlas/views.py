@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from services.robot_driver.robot import Pose
 from services.robot_driver.simulated.scene import Scene
-from services.robot_driver.simulated.world import Obstacle, Route, World, load_world
+from services.robot_driver.simulated.world import World, load_world
+from services.robot_driver.simulated.world_parts import Obstacle, Route
 from shared.config import RobotConfig
 from shared.rl.preprocess import preprocess
 

@@ -6,7 +6,7 @@ from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from shared.codec import first_problem
+from shared.errors import first_problem
 
 
 class FaultSet(BaseModel):

@@ -22,7 +22,8 @@ import pybullet
 
 from services.robot_driver.robot import Pose
 from services.robot_driver.simulated.textures import box_picture, flat_tile, wall_picture
-from services.robot_driver.simulated.world import Floats, Obstacle, Surface, World
+from services.robot_driver.simulated.world import World
+from services.robot_driver.simulated.world_parts import Floats, Obstacle, Surface
 from shared.config import CameraConfig
 
 REACH_M = 0.5

@@ -31,14 +31,8 @@ from services.robot_driver.robot import (
 from services.robot_driver.simulated.kinematics import advance, wrap
 from services.robot_driver.simulated.lap_counter import LapCounter
 from services.robot_driver.simulated.scene import Scene
-from services.robot_driver.simulated.world import (
-    MAX_OBSTACLES,
-    Obstacle,
-    Start,
-    World,
-    WorldError,
-    load_world,
-)
+from services.robot_driver.simulated.world import World, WorldError, load_world
+from services.robot_driver.simulated.world_parts import Obstacle, Start
 from shared.config import RobotConfig
 from shared.rl.preprocess import preprocess
 
@@ -150,11 +144,7 @@ class SimRobot(Robot):
             ValueError: One of that name stands there, it does not fit into the world, it overlaps
                 the robot, or there are too many. Nothing has changed then.
         """
-        if any(other.name == obstacle.name for other in self.obstacles):
-            raise ValueError(f"there is already an obstacle {obstacle.name!r}")
-        if len(self.obstacles) >= MAX_OBSTACLES:
-            raise ValueError(f"there are {MAX_OBSTACLES} obstacles already")
-        self.world.check_obstacle(obstacle)
+        self.world.check_placing(obstacle, [other.name for other in self.obstacles])
         obstacles = (*self.obstacles, obstacle)
         complaint = f"obstacle {obstacle.name!r} would overlap the robot"
         self._show(self._built(self.world, obstacles, self._pose, GAP_M, complaint))
@@ -175,11 +165,7 @@ class SimRobot(Robot):
             ValueError: There is no such start pose, or it touches something. Nothing has changed
                 then.
         """
-        if not 0 <= start < len(world.starts):
-            raise ValueError(
-                f"world {world.name!r}: expected a start from 0 to {len(world.starts) - 1}, "
-                f"got {start}"
-            )
+        world.check_start(start)
         self._show(self._at_start(world, start))
         self.world, self.obstacles = world, world.obstacles
         self._pose, self._velocity = _pose_of(world.starts[start]), STANDSTILL

@@ -14,7 +14,8 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from services.robot_driver.simulated.world import Colour, Fixture, Texture, Wall, World
+from services.robot_driver.simulated.world import World
+from services.robot_driver.simulated.world_parts import Colour, Fixture, Texture, Wall
 
 Picture = npt.NDArray[np.uint8]
 """uint8 [h, w, 3], RGB, first row at the top."""
@@ -41,14 +42,13 @@ def wall_picture(world: World, wall: Wall, segment: int) -> Picture:
     canvas = _blank(length, world.height_m, texture.rgb)
     _MATERIALS[texture.kind](canvas, texture)
     here = [f for f in world.fixtures if f.wall == wall.name and f.segment == segment]
-    for fixture in here:
-        if fixture.kind not in _LUMINOUS:
-            _FIXTURES[fixture.kind](canvas, fixture, length, world.height_m)
     ax, ay, bx, by = wall.segments[segment]
-    _light(canvas, math.atan2(by - ay, bx - ax))
-    for fixture in here:
-        if fixture.kind in _LUMINOUS:
-            _FIXTURES[fixture.kind](canvas, fixture, length, world.height_m)
+    for luminous in (False, True):  # what has light of its own is not dimmed by that of the wall
+        for fixture in here:
+            if (fixture.kind in _LUMINOUS) == luminous:
+                _FIXTURES[fixture.kind](canvas, fixture, _place(fixture, length))
+        if not luminous:
+            _light(canvas, math.atan2(by - ay, bx - ax))
     return _finish(canvas)
 
 
@@ -225,10 +225,9 @@ def _strip_light(canvas: Canvas, texture: Texture) -> None:
     _box(canvas, 0.2, size * 0.4 + 0.06, size - 0.4, 0.12, (255, 255, 250))
 
 
-def _door(canvas: Canvas, fixture: Fixture, length: float, height: float) -> None:
+def _door(canvas: Canvas, fixture: Fixture, place: Box) -> None:
     """Frame, leaf in one of three styles, handle."""
-    del height
-    x, y, w, h = _place(fixture, length)
+    x, y, w, h = place
     _box(canvas, x, y, w, h, _mix(fixture.rgb, 0.45))
     _box(canvas, x + 0.07, y, w - 0.14, h - 0.07, fixture.rgb)
     _LEAVES[fixture.style or "panelled"](canvas, fixture, (x + 0.07, y, w - 0.14, h - 0.07))
@@ -262,10 +261,9 @@ def _chevron_leaf(canvas: Canvas, fixture: Fixture, leaf: Box) -> None:
     part[((rows - rise) // (0.2 * _DRAW)) % 2 == 0] = (248, 248, 244)
 
 
-def _window(canvas: Canvas, fixture: Fixture, length: float, height: float) -> None:
+def _window(canvas: Canvas, fixture: Fixture, place: Box) -> None:
     """Panes with sky, frame, sill."""
-    del height
-    x, y, w, h = _place(fixture, length)
+    x, y, w, h = place
     _box(canvas, x - 0.05, y - 0.06, w + 0.1, h + 0.06, fixture.rgb)
     for k in range(8):
         _box(canvas, x, y + h * k / 8, w, h / 8, (170 + 8 * k, 200 + 5 * k, 225 + 3 * k))
@@ -275,10 +273,9 @@ def _window(canvas: Canvas, fixture: Fixture, length: float, height: float) -> N
     _box(canvas, x - 0.05, y - 0.06, w + 0.1, 0.06, _mix(fixture.rgb, 0.7))
 
 
-def _glazing(canvas: Canvas, fixture: Fixture, length: float, height: float) -> None:
+def _glazing(canvas: Canvas, fixture: Fixture, place: Box) -> None:
     """A glass front with daylight behind it: brightest overhead, between dark mullions."""
-    del height
-    x, y, w, h = _place(fixture, length)
+    x, y, w, h = place
     _box(canvas, x, y, w, h, fixture.rgb)
     panes = max(1, round(w / 0.9))
     wide = w / panes
@@ -290,10 +287,9 @@ def _glazing(canvas: Canvas, fixture: Fixture, length: float, height: float) -> 
     _box(canvas, x, y + h * 0.3, w, 0.06, fixture.rgb)
 
 
-def _board(canvas: Canvas, fixture: Fixture, length: float, height: float) -> None:
+def _board(canvas: Canvas, fixture: Fixture, place: Box) -> None:
     """Notice board with sheets of paper."""
-    del height
-    x, y, w, h = _place(fixture, length)
+    x, y, w, h = place
     _box(canvas, x, y, w, h, _mix(fixture.rgb, 0.5))
     _box(canvas, x + 0.04, y + 0.04, w - 0.08, h - 0.08, fixture.rgb)
     columns = max(1, int((w - 0.1) / 0.3))
@@ -303,10 +299,9 @@ def _board(canvas: Canvas, fixture: Fixture, length: float, height: float) -> No
         _box(canvas, left, y + h - tall - 0.12, 0.2, tall, (244, 242, 232))
 
 
-def _radiator(canvas: Canvas, fixture: Fixture, length: float, height: float) -> None:
+def _radiator(canvas: Canvas, fixture: Fixture, place: Box) -> None:
     """Ribs with dark gaps."""
-    del height
-    x, y, w, h = _place(fixture, length)
+    x, y, w, h = place
     _box(canvas, x, y, w, h, _mix(fixture.rgb, 0.65))
     ribs = max(1, round(w / 0.2))
     for k in range(ribs):
@@ -332,7 +327,7 @@ _MATERIALS: dict[str, Callable[[Canvas, Texture], None]] = {
     "planks": _planks,
     "strip-light": _strip_light,
 }
-_FIXTURES: dict[str, Callable[[Canvas, Fixture, float, float], None]] = {
+_FIXTURES: dict[str, Callable[[Canvas, Fixture, Box], None]] = {
     "door": _door,
     "window": _window,
     "glazing": _glazing,
@@ -340,7 +335,7 @@ _FIXTURES: dict[str, Callable[[Canvas, Fixture, float, float], None]] = {
     "radiator": _radiator,
 }
 _LUMINOUS = ("glazing",)
-"""Fixtures with light of their own: the light of the wall does not dim them."""
+"""Fixtures with light of their own."""
 _LEAVES: dict[str, Callable[[Canvas, Fixture, Box], None]] = {
     "panelled": _panelled_leaf,
     "flush": _flush_leaf,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import tomllib
+from collections.abc import Collection
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Self
@@ -19,46 +20,21 @@ import numpy.typing as npt
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from services.robot_driver.simulated.world_parts import (
-    Colour,
-    DoorStyle,
     Fixture,
     Floats,
     Lap,
     Length,
-    Material,
     Obstacle,
     Part,
-    Place,
     Route,
     Start,
     Surface,
     Text,
     Texture,
     Wall,
+    inside,
 )
-from shared.errors import ConfigError
-
-__all__ = [
-    "MAX_OBSTACLES",
-    "WORLDS",
-    "Colour",
-    "DoorStyle",
-    "Fixture",
-    "Floats",
-    "Lap",
-    "Material",
-    "Obstacle",
-    "Place",
-    "Route",
-    "Start",
-    "Surface",
-    "Texture",
-    "Wall",
-    "World",
-    "WorldError",
-    "load_world",
-    "read_world",
-]
+from shared.errors import ConfigError, first_problem
 
 WORLDS = Path(__file__).parent / "worlds"
 """Folder of the worlds that come with the driver."""
@@ -168,6 +144,22 @@ class World(Part):
         if twice:
             raise ValueError(f"route.places: two are named {twice[0]!r}")
 
+    def check_placing(self, obstacle: Obstacle, there: Collection[str]) -> None:
+        """Whether a box can be placed beside those of these names. Raises ValueError."""
+        if obstacle.name in there:
+            raise ValueError(f"there is already an obstacle {obstacle.name!r}")
+        if len(there) >= MAX_OBSTACLES:
+            raise ValueError(f"there are {MAX_OBSTACLES} obstacles already")
+        self.check_obstacle(obstacle)
+
+    def check_start(self, start: int) -> None:
+        """Whether there is a start pose of this number. Raises ValueError."""
+        if not 0 <= start < len(self.starts):
+            raise ValueError(
+                f"world {self.name!r}: expected a start from 0 to {len(self.starts) - 1}, "
+                f"got {start}"
+            )
+
     def check_obstacle(self, obstacle: Obstacle) -> None:
         """Whether a box can stand in this world; it may touch or reach into walls.
 
@@ -212,12 +204,7 @@ class World(Part):
 
     def between_walls(self, points: Floats) -> npt.NDArray[np.bool_]:
         """Whether points float64 [n, 2] lie inside the boundary and off islands."""
-        x, y = points[:, 0, None], points[:, 1, None]
-        ax, ay, bx, by = self.segments.T[:, None, :]
-        spans = (ay > y) != (by > y)
-        rise = np.where(by == ay, 1.0, by - ay)
-        crosses = spans & (x < ax + (y - ay) / rise * (bx - ax))
-        return np.asarray(np.count_nonzero(crosses, axis=1) % 2 == 1)
+        return inside(self.segments, points)
 
     def free(self, points: Floats) -> npt.NDArray[np.bool_]:
         """Whether points float64 [n, 2] lie between the walls and in no obstacle."""
@@ -310,14 +297,7 @@ def read_world(path: Path) -> World:
     try:
         world = World.model_validate(tree)
     except ValidationError as error:
-        raise WorldError(f"{path.name}: {_first_line(error)}") from error
+        raise WorldError(f"{path.name}: {first_problem(error)}") from error
     if world.name != path.stem:
         raise WorldError(f"{path.name}: name: {world.name!r} does not match the file name")
     return world
-
-
-def _first_line(error: ValidationError) -> str:
-    first = error.errors(include_url=False, include_context=False)[0]
-    key = ".".join(str(part) for part in first["loc"])
-    text = first["msg"].removeprefix("Value error, ")
-    return f"{key}: {text}" if key else text

@@ -33,6 +33,16 @@ FixtureKind = Literal["door", "window", "glazing", "board", "radiator"]
 DoorStyle = Literal["panelled", "flush", "chevron"]
 
 
+def inside(segments: Floats, points: Floats) -> npt.NDArray[np.bool_]:
+    """Whether points float64 [n, 2] lie in loops of segments float64 [s, 4], and off islands."""
+    x, y = points[:, 0, None], points[:, 1, None]
+    ax, ay, bx, by = segments.T[:, None, :]
+    spans = (ay > y) != (by > y)
+    rise = np.where(by == ay, 1.0, by - ay)
+    crosses = spans & (x < ax + (y - ay) / rise * (bx - ax))
+    return np.asarray(np.count_nonzero(crosses, axis=1) % 2 == 1)
+
+
 class Part(BaseModel):
     """Base of all parts of a world: frozen, strict, unknown keys refused."""
 

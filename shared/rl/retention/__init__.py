@@ -1,1 +1,1 @@
-"""Which samples go when the memory is full: one file a strategy, listed in `table`."""
+"""Which samples go when the memory is full: strategies, listed in `table`."""

@@ -12,9 +12,15 @@ import numpy as np
 
 from shared.facts import ACTION_COUNT, SHORT_NAMES
 from shared.rl.descriptor import BITS, threshold_bits
-from shared.rl.retention.amounts import surplus_by_action
 from shared.rl.retention.columns import DESCRIBED, renew_descriptors
-from shared.rl.retention.strategy import Discard, Rows, Situation, Strategy
+from shared.rl.retention.strategy import (
+    Discard,
+    Rows,
+    Situation,
+    Strategy,
+    kept_in_total,
+    surplus_by_action,
+)
 from shared.rl.similarity import Descriptors, Mask, similar_to_newer
 
 if TYPE_CHECKING:
@@ -162,7 +168,31 @@ class RMM(Strategy):
         return any(np.count_nonzero(marked[own]) < max(least, surplus) for own, surplus in losing)
 
 
-STRATEGY = RMM()
+class Novelty(RMM):
+    """The mirror of RMM: of two similar samples of one action the newer is the candidate.
+
+    Quotas, thresholds, counts and the order in which candidates go, oldest first, are those of RMM.
+    """
+
+    def similar(self, descriptors: Descriptors, bits: int, rule: Rule) -> Mask:
+        """Mark samples of one action that look like an older one: bool [n]."""
+        return similar_to_newer(descriptors[::-1], bits, rule)[::-1]
+
+
+class RMMTotal(RMM):
+    """RMM without quotas: candidates go whatever their action, until floor(0.99 N) samples remain.
+
+    Too few candidates are too few of all actions together.
+    """
+
+    def losing(self, memory: ReplayMemory, capacity: int) -> list[Part]:
+        """Return the whole memory and how much of it must go; nothing if it fits."""
+        if len(memory) <= capacity:
+            return []
+        return [Part(np.ones(len(memory), np.bool_), len(memory) - kept_in_total(capacity))]
+
+
+STRATEGY, NOVELTY, RMM_TOTAL = RMM(), Novelty(), RMMTotal()
 
 
 def scaled_count(count: int, capacity: int) -> int:

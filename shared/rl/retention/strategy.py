@@ -1,4 +1,7 @@
-"""The interface of a strategy of retention, and the discard that every strategy takes part in."""
+"""The interface of a strategy of retention, and the discard that every strategy takes part in.
+
+What stays is 99 % of the capacity, or of each action's share of it (A27, A33, E22).
+"""
 
 # ruff: noqa: ARG002  (defaults of an interface)
 
@@ -8,50 +11,23 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
+from shared.facts import ACTION_COUNT
 from shared.rl.draws import uniform
 from shared.rl.retention.table import STRATEGIES, TELLS
 
 if TYPE_CHECKING:
     from shared.config import MemoryConfig
     from shared.rl.engine import Progress
-    from shared.rl.memory import Ids, Images, ReplayMemory
+    from shared.rl.memory import Ids, ReplayMemory
+    from shared.rl.predictor import Predictor
 
 Rows = npt.NDArray[np.void]
 Floats = npt.NDArray[np.float64]
-
-
-class Network(Protocol):
-    """The target network as far as strategies use it. A `Predictor` is one."""
-
-    version: int
-
-    def descriptors(
-        self, images: Images, progress: Progress | None = None
-    ) -> npt.NDArray[np.uint8]:
-        """Return the packed 120-bit descriptors of images: uint8 [n, 15]."""
-
-    def unit_descriptors(
-        self, images: Images, progress: Progress | None = None
-    ) -> npt.NDArray[np.uint8]:
-        """Return such descriptors made of the units of FConn1: uint8 [n, 15]."""
-
-    def values(
-        self, images: Images, actions: npt.NDArray[np.uint8], progress: Progress | None = None
-    ) -> npt.NDArray[np.float32]:
-        """Return Q(s, a) of the action of each image, clipped: float32 [n]."""
-
-    def hidden(
-        self, images: Images, actions: npt.NDArray[np.uint8], progress: Progress | None = None
-    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-        """Return what FConn3 says, float32 [n, 128], and the unclipped Q(s, a), float32 [n]."""
-
-    def first(self, seed: int) -> Network:
-        """Return the network of version 1, as a run with this seed begins."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +38,8 @@ class Situation:
     number: int
     """Global episode number, 0 while the memory is filled."""
     config: MemoryConfig
-    network: Network
+    network: Predictor
+    """The target network."""
     seed: int
     """Seed of the run, for strategies that draw by chance."""
     progress: Progress | None = None
@@ -136,7 +113,8 @@ def lowest(values: Floats, count: int) -> npt.NDArray[np.int64]:
 
 def strategy(name: str) -> Strategy:
     """Return the strategy of this name. Raises KeyError for an unknown one."""
-    found: Strategy = import_module(f"{__package__}.{STRATEGIES[name].module}").STRATEGY
+    row = STRATEGIES[name]
+    found: Strategy = getattr(import_module(f"{__package__}.{row.module}"), row.name)
     return found
 
 
@@ -169,3 +147,29 @@ def discard(there: Situation) -> Discard:
     memory.kept |= done.keep
     told = {**{name: memory.kept.get(name, 0) for name in TELLS}, **done.told}
     return replace(done, marked=done.marked or prepared, told=told)
+
+
+def kept_in_total(capacity: int) -> int:
+    """Return the samples kept in total: floor(0.99 N)."""
+    return 99 * capacity // 100
+
+
+def kept_of_action(capacity: int) -> int:
+    """Return the samples kept of an action above its share: floor(0.99 N / 3)."""
+    return 99 * capacity // (100 * ACTION_COUNT)
+
+
+def surplus(memory: ReplayMemory) -> int:
+    """Return how many samples must go, whichever they are."""
+    return max(0, len(memory) - kept_in_total(memory.capacity))
+
+
+def surplus_by_action(memory: ReplayMemory, capacity: int) -> dict[int, int]:
+    """Return how many samples each action above its share of this capacity must lose."""
+    if len(memory) <= capacity:
+        return {}
+    return {
+        action: count - kept_of_action(capacity)
+        for action, count in enumerate(memory.by_action())
+        if ACTION_COUNT * count > capacity
+    }

@@ -19,7 +19,6 @@ from experiments.verdicts import (
     log_rates,
     max_t,
     paired,
-    probability_of_improvement,
 )
 
 FAST = settings(deadline=None, max_examples=40, derandomize=True)
@@ -115,11 +114,6 @@ def test_more_comparisons_make_each_less_sure() -> None:
 
 def test_the_middle_half_counts() -> None:
     assert interquartile_mean(np.array([0.0, 1.0, 2.0, 1000.0])) == 1.5
-
-
-def test_improvement_is_counted_over_all_pairs() -> None:
-    ours, theirs = np.array([1.0, 2.0]), np.array([2.0, 3.0])
-    assert probability_of_improvement(ours, theirs) == (3 + 0.5) / 4
 
 
 def test_so_many_seeds_would_decide() -> None:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import Result
+from typer.testing import CliRunner
 
 from experiments.baseline import dqn
-from experiments.baseline.dqn import EVALUATIONS, BaselinePlan, DistanceReward, planned
+from experiments.baseline.dqn import EVALUATIONS, DistanceReward, shared_config
 from experiments.drives.choosers import Chooser, uniform
 from experiments.environment import CorridorEnv
 from experiments.plans.plan import stage_config
@@ -40,14 +41,24 @@ class Pretender:
         return self.actions // 4
 
 
-def plan(out: Path) -> BaselinePlan:
-    words = ["--actions", "207", "--starts", "1", "--drive-actions", "30", "--out", str(out)]
-    return planned(words)
+def invoked(words: str) -> Result:
+    return CliRunner().invoke(dqn.app, words.split())
 
 
-def test_a_run_is_evaluated_at_equal_intervals_as_ours_is(tmp_path: Path) -> None:
-    dqn.run(plan(tmp_path / "seed-1"), Pretender())
-    rows = read_csv(tmp_path / "seed-1" / "evaluations.csv", EVALUATION_COLUMNS)
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a run leaves behind."""
+    out = tmp_path_factory.mktemp("baseline") / "seed-1"
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(importlib.util, "find_spec", lambda name: name)
+        patched.setattr(dqn, "Dqn", lambda config, reward: Pretender())
+        done = invoked(f"--actions 207 --starts 1 --drive-actions 30 --out {out}")
+    assert done.exit_code == 0, done.output
+    return out
+
+
+def test_a_run_is_evaluated_at_equal_intervals_as_ours_is(folder: Path) -> None:
+    rows = read_csv(folder / "evaluations.csv", EVALUATION_COLUMNS)
     assert [int(row["total_actions"]) for row in rows] == [
         207 * n // EVALUATIONS for n in range(1, EVALUATIONS + 1)
     ]
@@ -56,51 +67,52 @@ def test_a_run_is_evaluated_at_equal_intervals_as_ours_is(tmp_path: Path) -> Non
     assert rows[-1]["train_steps"] == "51"
 
 
-def test_reports_can_read_what_was_run(tmp_path: Path) -> None:
-    chosen = plan(tmp_path)
-    dqn.run(chosen, Pretender())
-    info = read_info(tmp_path / "run.json")
+def test_reports_can_read_what_was_run(folder: Path) -> None:
+    info = read_info(folder / "run.json")
     assert (info.experiment, info.actions, info.train_steps, info.seed) == (
         "dqn-progress", 207, 51, 1,
     )  # fmt: skip
     assert info.complete
-    command = json.loads((tmp_path / "run.json").read_text())["command"]
-    assert "--actions 207" in command
-    assert str(tmp_path) not in command
+    assert "--actions 207" in info.command
+    assert str(folder) not in info.command
 
 
 def test_what_is_shared_with_ours_comes_from_the_plan() -> None:
-    words = "--like plus-minus --scale tenth --seed 5 --threads 2 --reward distance --out x"
-    made = planned(words.split())
     ours = load_plan("plus-minus", "tenth")
-    config, last = made.config, stage_config(ours, len(ours.stages) - 1, 5)
+    config, last = (
+        shared_config(ours, 5, "distance", 2),
+        stage_config(ours, len(ours.stages) - 1, 5),
+    )
     assert (config.network, config.robot, config.episode) == (
         last.network, last.robot, last.episode,
     )  # fmt: skip
     assert (config.memory.capacity, config.run.seed) == (last.memory.capacity, 5)
-    assert (made.scale, made.factor, config.numerics.learner.threads) == ("tenth", 10, 2)
+    assert (config.run.name, config.numerics.learner.threads) == ("dqn-distance", 2)
 
 
-def test_an_unknown_plan_is_refused_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert dqn.main(["--like", "nothing", "--out", "x"]) == 2
-    assert "got 'nothing'" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("words", ["", "--actions 0 --out x", "--reward fame --out x"])
-def test_wrong_words_are_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        planned(words.split())
-    assert ended.value.code == 2
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        ("--like nothing --out x", "got 'nothing'"),
+        ("--reward fame --out x", "got 'fame'"),
+        ("--actions 0 --out x", "--actions"),
+        ("", "--out"),
+    ],
+)
+def test_wrong_words_are_refused(words: str, complaint: str) -> None:
+    done = invoked(words)
+    assert done.exit_code == 2
+    assert complaint in done.stderr
 
 
 def test_without_its_library_one_line_tells_how_to_get_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    assert dqn.main(["--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert "make bench-peers" in said
+    done = invoked(f"--out {tmp_path / 'out'}")
+    assert done.exit_code == 2
+    assert done.stderr.count("\n") == 1
+    assert "make bench-peers" in done.stderr
     assert not (tmp_path / "out").exists()
 
 

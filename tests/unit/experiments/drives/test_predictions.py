@@ -9,13 +9,7 @@ import numpy.typing as npt
 import pytest
 from builders import make_config
 
-from experiments.drives.predictions import (
-    BEFORE_WALL,
-    Judged,
-    figures,
-    judged,
-    prediction_figures,
-)
+from experiments.drives.predictions import BEFORE_WALL, figures, judged, prediction_figures
 from experiments.drives.traces import Trace
 from experiments.environment import CorridorEnv
 from shared.config import Config
@@ -69,33 +63,24 @@ def test_rewards_are_those_of_the_equation(bumps: list[int]) -> None:
     chosen = draw.integers(0, 3, 100)
     found = judged(way, values, chosen, CONFIG)
     expected = naive(way, values, chosen)
-    assert len(found.predicted) == len(expected)
-    if expected:
-        q, rewards, near = zip(*expected, strict=True)
-        np.testing.assert_allclose(found.predicted, q)
-        np.testing.assert_allclose(found.observed, rewards, atol=1e-6)
-        assert found.before_wall.tolist() == list(near)
+    np.testing.assert_allclose(found, np.array(expected).reshape(-1, 3).T, atol=1e-6)
 
 
 def test_figures_tell_how_far_predictions_reach() -> None:
     observed = np.linspace(-1.0, 1.0, 40)
     walls = observed < -0.5
-    exact = figures(Judged(observed, observed, walls))
+    exact = figures(np.stack([observed, observed, walls]))
     assert exact["value_rank"] == pytest.approx(1.0)
     assert exact["value_slope"] == pytest.approx(1.0)
     assert exact["wall_value"] == pytest.approx(observed[walls].mean())
-    flat = figures(Judged(0.2 + 0.1 * observed, observed, walls))
+    flat = figures(np.stack([0.2 + 0.1 * observed, observed, walls]))
     assert (flat["value_rank"], flat["value_slope"]) == (pytest.approx(1.0), pytest.approx(10.0))
 
 
 def test_what_cannot_be_told_is_no_number() -> None:
-    same, none = np.full(9, 0.3), np.zeros(9, np.bool_)
-    assert all(math.isnan(value) for value in figures(Judged(same, same, none)).values())
-    nothing = np.zeros(0)
-    assert all(
-        math.isnan(value)
-        for value in figures(Judged(nothing, nothing, np.zeros(0, np.bool_))).values()
-    )
+    same, none = np.full(9, 0.3), np.zeros(9)
+    for found in (np.stack([same, same, none]), np.zeros((3, 0))):
+        assert all(math.isnan(value) for value in figures(found).values())
 
 
 class Bright:

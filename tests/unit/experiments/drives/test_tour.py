@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from experiments.drives.choosers import GREEDY
-from experiments.drives.routes import Route
-from experiments.drives.tour import BOX_NAME, Tour, drive_tour, route_share
-from experiments.drives.traces import Trace
+from experiments.drives.tour import BOX_NAME, drive_tour, passes, route_share
 from experiments.environment import CorridorEnv
+from experiments.records import TourRecord
 from services.robot_driver.robot import Pose
 from services.robot_driver.simulated.world import load_world
 from shared.config import Config, PolicyConfig
@@ -65,29 +63,29 @@ def test_a_negative_prediction_turns_on_the_spot_in_one_direction_until_it_is_no
     np.testing.assert_allclose(np.diff(headings), [sense * turn, sense * turn, 0.0], atol=1e-9)
     places = tour.route.trace.places_m
     np.testing.assert_allclose(places[0], places[2])
-    assert tour.turned == 2
-    assert tour.driven == MOST
+    assert tour.told.turned == 2
+    assert tour.told.driven == MOST
 
 
 def test_a_robot_that_finds_no_way_out_drives_on_after_two_full_turns(env: CorridorEnv) -> None:
     tour = drive_tour(env, Scripted(lambda _: (-0.1, -0.5, -0.5)), START, 0, most_driven=MOST)
     turn = np.rad2deg(env.config.robot.turn_rad_s * env.config.robot.period_s)
     per_drive = int(np.ceil(720.0 / turn))
-    assert tour.turned == pytest.approx(per_drive * tour.driven, abs=per_drive)
+    assert tour.told.turned == pytest.approx(per_drive * tour.told.driven, abs=per_drive)
     assert len(tour.route.trace.bumps) == 4 * MOST
-    assert not tour.passed
+    assert not tour.told.passed
 
 
 def test_bumps_are_counted_and_told_and_the_box_is_taken_away(env: CorridorEnv) -> None:
     tour = drive_tour(env, Scripted(lambda _: (1.0, 0.0, 0.0)), START, 0, most_driven=MOST)
     told = [event.text for event in tour.route.events]
-    assert tour.bumps == told.count("bumps") > 0
+    assert tour.told.bumps == told.count("bumps") > 0
     assert [event.number for event in tour.route.events] == list(range(1, len(told) + 1))
     ways_m = tour.route.trace.way_m[tour.route.trace.bumps]  # without the way back from the wall
     robot = env.config.robot
     assert ways_m.max() <= robot.speed_m_s * robot.period_s + 1e-6
     assert BOX_NAME not in [obstacle.name for obstacle in env.robot.obstacles]
-    assert not tour.passed
+    assert not tour.told.passed
 
 
 def test_a_policy_may_choose_what_seems_as_good(env: CorridorEnv) -> None:
@@ -102,15 +100,16 @@ def test_a_policy_may_choose_what_seems_as_good(env: CorridorEnv) -> None:
 
 
 def test_a_full_drive_past_the_box_without_a_bump_passes_and_nothing_less() -> None:
-    still = np.zeros(3)
-    trace = Trace("i16c", np.array([False, False]), np.zeros((3, 2)), still, still[1:], 0, 0)
-    full = Tour(Route(trace), 300, 9, 0.6, ("west", "east"), True)
-    assert full.passed
-    assert not replace(full, driven=299).passed
-    assert not replace(full, route_share=0.59).passed
-    assert not replace(full, bridges=("west",)).passed
-    assert not replace(full, box_dropped=False).passed
-    assert not replace(full, route=Route(replace(trace, bumps=np.array([False, True])))).passed
+    full = TourRecord(
+        passed=False, driven=300, turned=9, bumps=0, route_share=0.6, bridges=("west", "east"),
+        box_dropped=True,
+    )  # fmt: skip
+    assert passes(full)
+    for less in (
+        {"driven": 299}, {"route_share": 0.59}, {"bridges": ("west",)}, {"box_dropped": False},
+        {"bumps": 1},
+    ):  # fmt: skip
+        assert not passes(full.model_copy(update=less))
 
 
 def test_the_share_of_the_route_is_that_of_its_length() -> None:

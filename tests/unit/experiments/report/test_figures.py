@@ -9,11 +9,11 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from experiments.report.figures import drives, memory, probes, progress
-from experiments.report.figures.drives import Compared
 from experiments.report.figures.probes import chosen
 from experiments.report.figures.style import ACTION_COLOURS, PALETTE, colours, png, told_apart
-from experiments.report.run_folder import Experiment, Probes, load
-from experiments.report.statistics import Difference, block_means
+from experiments.report.run_folder import Experiment, load
+from experiments.report.statistics import block_means
+from experiments.runs.probes import Probes
 from shared.facts import SHORT_NAMES
 from tests.synthetic_runs import write_run
 
@@ -89,23 +89,11 @@ def test_bars_of_the_memory_are_the_newest_medians(found: dict[str, Experiment])
 def test_bars_stand_where_their_action_leads() -> None:
     values = np.array([[0.1, 0.2, 0.3], [-0.1, -0.2, -0.3]])
     images = np.zeros((2, 50, 75), np.uint8)
-    shown = Probes("best-plus", "plus", images, values)
-    networks = [probes.Predictions("a", values), probes.Predictions("b", -values)]
-    figure = probes.predictions(shown, networks, 6)
+    shown = Probes("plus", images, values)
+    figure = probes.predictions(shown, {"a": values, "b": -values}, 6)
     bars = [heights(axes) for axes in figure.axes if axes.patches]
     assert bars == [[0.2, 0.1, 0.3], [-0.2, -0.1, -0.3], [-0.2, -0.1, -0.3], [0.2, 0.1, 0.3]]
     assert small_texts(figure) == []
-
-
-def test_only_a_sure_difference_is_filled() -> None:
-    pairs = [
-        Compared("a", "b", "plus", (3, 3), Difference(-2.0, -3.0, -1.0)),
-        Compared("a", "c", "plus", (3, 3), Difference(-2.0, -3.0, 1.0)),
-    ]
-    lines = drives.differences(pairs).axes[0].lines
-    faces = [line.get_markerfacecolor() for line in lines if line.get_marker() == "o"]
-    assert faces[0] != "white"
-    assert faces[1] == "white"
 
 
 def test_floor_and_ceiling_are_lines_across(found: dict[str, Experiment]) -> None:

@@ -1,4 +1,4 @@
-"""Numbers of runs: equal actions, what was kept, how numbers are written."""
+"""Numbers of runs: what was kept, how numbers are written."""
 
 from __future__ import annotations
 
@@ -6,54 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from experiments.report.measures import (
-    at_equal_actions,
-    difference_at_equal_actions,
-    kept,
-    number,
-    spread,
-    ways_between_bumps,
-)
-from experiments.report.run_folder import Experiment, Rows
+from experiments.report.measures import kept, number, spread, ways_between_bumps
+from experiments.report.run_folder import Rows
 from tests.synthetic_runs import experiment
-
-
-def test_equal_actions_are_those_of_the_seed_that_drove_less(tmp_path: Path) -> None:
-    before, rmm = (experiment(tmp_path, name, (1, 2)) for name in ("plus-normm", "plus-rmm"))
-    named = {"plus-normm": before, "plus-rmm": rmm}
-    for each, run, rival in zip(
-        at_equal_actions(rmm, before, named, "plus"), rmm.runs, before.runs, strict=True
-    ):
-        ends = [int(r.evaluated("plus").rows[-1]["total_actions"]) for r in (run, rival)]
-        assert each.actions == min(ends)
-        for value, side in ((each.ours, run), (each.theirs, rival)):
-            until = [
-                float(row["bumps_per_1000"])
-                for row in side.evaluated("plus").rows
-                if int(row["total_actions"]) <= each.actions
-            ]
-            assert value == until[-1]
-    assert difference_at_equal_actions("plus-rmm", "plus-normm", "plus", [each]) is None
-
-
-@pytest.mark.parametrize(("end", "theirs"), [(100, 10.0), (60, 20.0), (40, 30.0)])
-def test_the_drives_of_a_predecessor_come_before(tmp_path: Path, end: int, theirs: float) -> None:
-    def driven(name: str, *drives: tuple[int, float]) -> Experiment:
-        (run,) = experiment(tmp_path, name).runs
-        plain = run.evaluated("plus").rows[0]
-        rows = tuple(
-            plain | {"total_actions": str(actions), "bumps_per_1000": str(bumps)}
-            for actions, bumps in drives
-        )
-        return Experiment((replace(run, evaluations=Rows(rows)),))
-
-    rmm = driven("plus-rmm", (0, 50.0), (end, 9.0))
-    before = driven("plus-normm", (0, 60.0), (40, 30.0))
-    after = driven("plus-normm-fit", (41, 20.0), (90, 10.0), (150, 5.0))
-    (found,) = at_equal_actions(rmm, after, {"plus-normm": before}, "plus")
-    assert (found.seed, found.actions, found.ours, found.theirs) == (1, end, 9.0, theirs)
 
 
 def test_what_was_kept_compares_the_drives_around_the_other_corridor(tmp_path: Path) -> None:

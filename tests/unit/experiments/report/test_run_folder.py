@@ -57,7 +57,7 @@ def test_samples_by_corridor_are_numbers_for_every_episode(tmp_path: Path) -> No
 def test_routes_and_probes_are_read(folder: Path) -> None:
     write_route(folder / "route-tour.npz", "plus", [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)])
     run = read_run(folder)
-    assert [probes.label for probes in run.probes] == ["best-plus", "learn-plus"]
+    assert list(run.probes) == ["best-plus", "learn-plus"]
     route = run.routes["tour"]
     assert route.trace.bumps.tolist() == [False, True]
     assert [event.text for event in route.events] == ["passes the window", "turns"]
@@ -91,7 +91,7 @@ def test_a_table_with_other_columns_is_refused(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "arrays", "message"),
     [
-        ("probes-x.npz", {"images": np.zeros(3)}, "expected an array 'values'"),
+        ("probes-x.npz", {"images": np.zeros(3)}, "world is not a file in the archive"),
         ("route-x.npz", {"places_m": np.zeros((3, 2))}, r"route-x\.npz: not the route of a drive"),
     ],
 )

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from experiments.records import EVALUATION_COLUMNS
-from experiments.report import findings, tables
-from experiments.report.document import Table
+from experiments.report import tables
 from experiments.report.full_report import all_sections
 from experiments.report.overview import overview
 from experiments.report.run_folder import load
@@ -67,20 +66,6 @@ def test_where_no_lap_was_looked_for_there_is_no_column(tmp_path: Path) -> None:
     assert "first lap after s" not in frozen(experiment, "plus").header
 
 
-def test_variants_of_the_demo_stand_side_by_side(tmp_path: Path) -> None:
-    for name, laps in (("search-fast", ({}, {})), ("search-demo", (LAP, {}))):
-        for seed, lap in zip((101, 102), laps, strict=True):
-            write_run(tmp_path, name, seed, first_lap=lap, seconds=100.0 * seed)
-    compared = all_sections(load([tmp_path]))[1]
-    table = next(block for block in compared.blocks if isinstance(block, Table))
-    assert table.title.startswith("Variants of Search demo")
-    first, second = (dict(zip(table.header, row, strict=True)) for row in table.rows)
-    assert first["plan"] == "`search-demo`"
-    assert (first["drove a lap"], first["first lap after actions"]) == ("1 of 2", "8,123")
-    assert (first["seeds"], first["s in all"]) == ("101, 102", "10,150 (10,100 to 10,200)")
-    assert (second["drove a lap"], second["after s"]) == ("0 of 2", "-")
-
-
 def test_every_test_drive_has_a_row_and_a_damaged_file_is_named(tmp_path: Path) -> None:
     folder = write_run(tmp_path, "i16c-test", 1)
     path = folder / "tours.json"
@@ -94,8 +79,6 @@ def test_every_test_drive_has_a_row_and_a_damaged_file_is_named(tmp_path: Path) 
         ("tour-1", "no", "0", "30 %", "-", "yes"),
         ("tour-2", "no", "2", "62 %", "east-bridge, west-bridge", "no"),
     ]
-    (told,) = findings.tours(experiment)
-    assert "1 of 3 test drives were full and without a bump, 1 more without a bump but" in told
     (counted,) = tables.test_drives([experiment]).rows
     assert counted == ("i16c-test", "tenth", "1", "1 of 3", "2 of 3", "0, 0, 2")
     assert any(getattr(block, "rows", ()) == (counted,) for block in overview([experiment]).blocks)

@@ -25,7 +25,8 @@ from services.robot_driver.robot import (
     Velocity,
 )
 from services.robot_driver.simulated.sim import SimRobot
-from services.robot_driver.simulated.world import Obstacle, World, load_world
+from services.robot_driver.simulated.world import World, load_world
+from services.robot_driver.simulated.world_parts import Obstacle
 from services.robot_driver.world_changes import MAX_PENDING
 from shared.config import RobotConfig
 from shared.messages import Box, Episode, Observation, RobotProgress, WorldChange, WorldChanged

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shared.config import LearnerNumerics, LearningConfig, NetworkConfig, Numerics
-from shared.rl.batches import StoredBatches
+from shared.rl.batches import Batches
 from shared.rl.engine import network_input
 from shared.rl.learning import Trained, Trainer
 from shared.rl.memory import SampleStore
@@ -394,7 +394,7 @@ def test_shares_of_several_threads_add_up_to_the_mini_batch(precision: Any) -> N
     for threads in (1, 2, 2, 3, 16):
         numerics = LearnerNumerics(threads=threads, batch=4, precision=precision)
         trainer = Trainer(SMALL, LearningConfig(), numerics, 1)
-        trainer.gradients.compute(StoredBatches(store, "cpu"), ranks)
+        trainer.gradients.compute(Batches(store, "cpu"), ranks)
         trainers.append(trainer)
     alone, two, again, *others = (
         [p.grad for p in trainer.train_network.parameters()] for trainer in trainers

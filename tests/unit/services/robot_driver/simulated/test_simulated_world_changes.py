@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from services.robot_driver.robot import Pose, Velocity
 from services.robot_driver.simulated.sim import GAP_M, SKIN_M, SimRobot
-from services.robot_driver.simulated.world import MAX_OBSTACLES, Obstacle, World, load_world
+from services.robot_driver.simulated.world import MAX_OBSTACLES, World, load_world
+from services.robot_driver.simulated.world_parts import Obstacle
 from shared.config import RobotConfig
 
 CONFIG = RobotConfig()

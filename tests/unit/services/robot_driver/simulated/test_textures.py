@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from services.robot_driver.simulated.textures import TEXELS_PER_M, flat_tile, wall_picture
-from services.robot_driver.simulated.world import DoorStyle, Material, Texture, World, load_world
+from services.robot_driver.simulated.world import World, load_world
+from services.robot_driver.simulated.world_parts import DoorStyle, Material, Texture
 
 WORLD = load_world("plus")
 PLACES = [(wall, i) for wall in WORLD.walls for i in range(len(wall.points))]

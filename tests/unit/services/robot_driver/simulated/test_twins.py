@@ -12,7 +12,8 @@ from services.robot_driver.robot import Velocity
 from services.robot_driver.simulated import sim
 from services.robot_driver.simulated.scene import Scene
 from services.robot_driver.simulated.sim import SimRobot
-from services.robot_driver.simulated.world import Obstacle, load_world
+from services.robot_driver.simulated.world import load_world
+from services.robot_driver.simulated.world_parts import Obstacle
 from shared.config import RobotConfig
 
 CONFIG = RobotConfig()

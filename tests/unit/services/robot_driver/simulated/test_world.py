@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 
 from services.robot_driver.simulated.world import (
     WORLDS,
-    Obstacle,
     World,
     WorldError,
     load_world,
     read_world,
     world_files,
 )
+from services.robot_driver.simulated.world_parts import Obstacle
 
 PLUS = (WORLDS / "plus.toml").read_text(encoding="utf-8")
 

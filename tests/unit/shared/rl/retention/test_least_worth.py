@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from shared.config import MemoryConfig
 from shared.rl.memory import ReplayMemory
+from shared.rl.retention.least_worth import equal_quotas
 from shared.rl.retention.strategy import Discard, Situation, chances, discard
-from shared.rl.retention.worlds import equal_quotas
 
 FAST = settings(deadline=None, max_examples=80, derandomize=True)
 CAPACITY, SEED = 30, 5

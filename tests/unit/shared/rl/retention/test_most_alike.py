@@ -15,9 +15,15 @@ from hypothesis import strategies as st
 from shared.config import MemoryConfig
 from shared.rl.draws import generator
 from shared.rl.memory import ReplayMemory
-from shared.rl.retention.coverage_pose import STRATEGY as POSES
-from shared.rl.retention.gradients import BITS, UNITS, sides
-from shared.rl.retention.most_alike import FAR, hamming, older_of_most_alike
+from shared.rl.retention.most_alike import (
+    COVERAGE_POSE,
+    FAR,
+    PLANES,
+    UNITS,
+    hamming,
+    older_of_most_alike,
+    sides,
+)
 from shared.rl.retention.strategy import Situation, discard
 
 FAST = settings(deadline=None, max_examples=30, derandomize=True)
@@ -123,7 +129,7 @@ def test_coverage_of_poses_removes_the_older_of_the_nearest(
         return math.hypot(x - x2, y - y2) + 0.5 * turned
 
     there = Situation(memory, 1, MemoryConfig(), FakePredictor(), seed=1)
-    found = POSES.distances(there)(np.arange(n), 0)
+    found = COVERAGE_POSE.distances(there)(np.arange(n), 0)
     every = [[distance(i, j) for j in range(n)] for i in range(n)]
     assert found == pytest.approx(np.array(every), rel=1e-9, abs=1e-7)
     expected = naive(lambda i, j: float(found[i, j]), n, n - 29)
@@ -161,7 +167,7 @@ def test_gradients_removes_the_older_of_the_most_alike(numbers: list[int]) -> No
     memory = memory_of([number.to_bytes(15, "little") for number in numbers])
     actions, rewards = memory.rows["action"].copy(), memory.rows["reward"].copy()
     images = memory.images(np.arange(n))
-    planes = generator(5, "gradients").standard_normal((UNITS, BITS))
+    planes = generator(5, "gradients").standard_normal((UNITS, PLANES))
     hashes = []
     for image, action, reward in zip(images, actions, rewards, strict=True):
         hidden, value = network.hidden(image[np.newaxis], np.array([action]))
