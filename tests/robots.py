@@ -83,6 +83,7 @@ def robotino() -> Iterator[Subject]:
     with robotino_server() as (emulated, address):
         config = real_time(kind="robotino", robotino={"address": address, "timeout_s": 2.0})
         with closing(make_robot(config)) as robot:
+            wait_until(lambda: fit(robot), 60, "the robot can be commanded")
             yield Subject(config, robot, lambda: emulated.robot.truth().pose, 1.0)
 
 
@@ -118,6 +119,10 @@ def ros2(velocity_type: str, **ros2: object) -> Callable[[], AbstractContextMana
         with ros2_emulator(**ros2, velocity_type=velocity_type) as emulated:
             config = real_time(kind="ros2", ros2={**ros2, "endpoint": emulated.endpoint})
             with closing(make_robot(config)) as robot:
+                if config.robot.ros2.bumper_on_change:  # somebody presses it once
+                    for fault in ("stuck", ""):
+                        emulated.change({"bumper": fault})
+                        wait_until(lambda fault=fault: touched(robot) == bool(fault), 60, "felt")  # type: ignore[misc]
                 wait_until(lambda: fit(robot), 60, "the robot can be commanded")
                 yield Subject(config, robot, lambda: emulated.robot.truth().pose, 1.0)
 
@@ -131,6 +136,14 @@ def fit(robot: Robot) -> bool:
     except NotReady:
         return False
     return True
+
+
+def touched(robot: Robot) -> bool | None:
+    """Whether a real robot's bumper is pressed; None where it is not ready to drive."""
+    try:
+        return robot.feel().contact
+    except NotReady:
+        return None
 
 
 SUBJECTS: dict[str, Callable[[], AbstractContextManager[Subject]]] = {

@@ -17,7 +17,8 @@ class Faults(FaultSet):
     """stuck: pressed; unreadable: status 500; nonsense: an object without the value."""
     odometry: Literal["", "frozen", "stalled", "empty"] = ""
     """frozen: the same reading again and again; stalled: the motors do not turn, readings go on."""
-    camera: Literal["", "frozen", "500", "truncated", "empty"] = ""
+    camera: Literal["", "frozen", "500", "truncated", "empty", "noiseless", "flat"] = ""
+    """noiseless: equal pictures where it stands; flat: one grey alone."""
     battery_low: bool = False
     stall_s: float = Field(default=0.0, ge=0.0, le=10.0)
     """Every answer comes so much later."""

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.robot_driver.real.odometry_frame import OdometryFrame, between, joined
+from services.robot_driver.real.odometry import OdometryFrame, between, joined
 from services.robot_driver.robot import Pose
 
 FAST = settings(deadline=None, max_examples=80, derandomize=True)
