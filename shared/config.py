@@ -15,6 +15,7 @@ import re
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
 
 from shared.facts import DEFAULT_ENDPOINT, DEFAULT_RUN, IMAGE_HEIGHT, IMAGE_WIDTH, NAME
 from shared.rl.retention.table import STRATEGIES
@@ -137,7 +138,7 @@ def _topic(name: str) -> str:
     """A ROS name; it becomes a Zenoh key, so nothing in it may be a pattern."""
     if re.fullmatch(r"(/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*)?", name):
         return name
-    raise ValueError(f"expected a ROS name such as 'cmd_vel' or '/bot1/odom', got {name!r:.60}")
+    raise PydanticCustomError("ros_name", "a ROS name such as 'cmd_vel' or '/bot1/odom'")
 
 
 OptionalTopic = Annotated[str, AfterValidator(_topic)]

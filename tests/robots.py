@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import dataclass
 
 from benchmarks.waiting import wait_until
@@ -119,10 +119,8 @@ def ros2(velocity_type: str, **ros2: object) -> Callable[[], AbstractContextMana
         with ros2_emulator(**ros2, velocity_type=velocity_type) as emulated:
             config = real_time(kind="ros2", ros2={**ros2, "endpoint": emulated.endpoint})
             with closing(make_robot(config)) as robot:
-                if config.robot.ros2.bumper_on_change:  # somebody presses it once
-                    for fault in ("stuck", ""):
-                        emulated.change({"bumper": fault})
-                        wait_until(lambda fault=fault: touched(robot) == bool(fault), 60, "felt")  # type: ignore[misc]
+                if config.robot.ros2.bumper_on_change:
+                    press(emulated, robot)
                 wait_until(lambda: fit(robot), 60, "the robot can be commanded")
                 yield Subject(config, robot, lambda: emulated.robot.truth().pose, 1.0)
 
@@ -138,12 +136,16 @@ def fit(robot: Robot) -> bool:
     return True
 
 
-def touched(robot: Robot) -> bool | None:
-    """Whether a real robot's bumper is pressed; None where it is not ready to drive."""
-    try:
-        return robot.feel().contact
-    except NotReady:
-        return None
+def press(emulated: EmulatedRos2, robot: Robot) -> None:
+    """Press and release the bumper until it was felt, as its operator does at the start."""
+
+    def felt() -> bool:
+        emulated.change({"bumper": "stuck" if emulated.faults.bumper == "" else ""})
+        with suppress(AssertionError):  # one message may be lost, and there is no other
+            wait_until(lambda: fit(robot), 2, "it was felt")
+        return fit(robot) and not robot.feel().contact
+
+    wait_until(felt, 60, "the bumper is felt")
 
 
 SUBJECTS: dict[str, Callable[[], AbstractContextManager[Subject]]] = {

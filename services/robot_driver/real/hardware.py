@@ -249,10 +249,13 @@ class HardwareRobot(Robot):
             if reading is None:
                 continue
             number = reading.number
-            with self._changed:
-                self._gate.feel(reading.value, self._clock())
-                if reading.value:
-                    self._changed.notify_all()
+            self._touched(reading.value)
+
+    def _touched(self, pressed: bool) -> None:
+        with self._changed:
+            self._gate.feel(pressed, self._clock())
+            if pressed:
+                self._changed.notify_all()
 
     def _send(self) -> None:
         """Send what the gate lets through, until the last stop is sent."""
@@ -264,21 +267,21 @@ class HardwareRobot(Robot):
                     deadline_s = min(deadline_s, now_s + CLOSING_S / 2.0)
                     if self._gate.silent or now_s > deadline_s:
                         return
-                if self._gate.wants_motion:
-                    self._gate.problem = self._problem_or_none(now_s)
-                velocity = self._gate.due(now_s)
+                velocity = self._due(now_s)
                 if velocity is None:
                     self._changed.wait(TICK_S if self._busy else 0.1)
                     continue
             self._hand_over(velocity)
 
-    def _problem_or_none(self, now_s: float) -> str:
-        """As `_problem`; a link that cannot even say is a problem, and no end of the sender."""
-        try:
-            return self._problem(now_s)
-        except Exception as error:
-            log.exception("looking at the robot failed")
-            return f"link: {type(error).__name__}: {error}"
+    def _due(self, now_s: float) -> Velocity | None:
+        """What the gate wants sent now; a link that cannot even say how it is lets nothing move."""
+        if self._gate.wants_motion:
+            try:
+                self._gate.problem = self._problem(now_s)
+            except Exception as error:
+                log.exception("looking at the robot failed")
+                self._gate.problem = f"link: {type(error).__name__}: {error}"
+        return self._gate.due(now_s)
 
     @property
     def _busy(self) -> bool:
