@@ -3,8 +3,8 @@
 #   make demo       install, then watch a simulated robot learn; Ctrl-C stops, again continues
 #   make test       install, then all checks and tests but the slow ones
 #
-# Variables: PYTHON (python3.11), ARGS (more options: for `corridor up` in demo, of mutants and
-# bench-peers), and TORCH_INDEX_URL: one of PyTorch's own package indexes, to choose a CPU-only or a
+# Variables: PYTHON (python3.11), ARGS (more options: for `corridor up` in demo, of mutants,
+# extras-test and bench-peers), and TORCH_INDEX_URL: one of PyTorch's own package indexes, to choose a CPU-only or a
 # CUDA build.
 
 PYTHON ?= python3.11
@@ -19,7 +19,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 BESIDE := -n 4 --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-full check lint unit system mutants compose-test bench profile bench-full bench-peers clean
+.PHONY: help setup demo test test-full check lint unit system mutants compose-test extras-test bench profile bench-full bench-peers clean
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
 
@@ -56,6 +56,9 @@ mutants: $(VENV)/.dev ## break one guarantee after the other in a copy: do its t
 
 compose-test: $(VENV)/.made ## images and containers, with kills; needs a Docker engine (docs/compose.md)
 	$(BIN)/python -m tests.compose.trial $(ARGS)
+
+extras-test: $(VENV)/.dev ## every extra from the wheel, in an environment that holds nothing else
+	$(BIN)/python -m tests.extras.trial $(ARGS)
 
 bench: $(VENV)/.dev ## measure speed and memory, in minutes; the machine should do nothing else
 	$(BIN)/python -m benchmarks.run_all --short

@@ -107,6 +107,8 @@ def keys(rounds: int) -> list[float]:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory())) / RUN
         up = [COMMAND, "up", "--run-dir", str(folder), "--set", f"run.name={RUN}"]
         person = stack.enter_context(Terminal([str(part) for part in up]))
+        stack.callback(person.process.wait, PATIENCE_S)
+        stack.callback(person.press, b"\x03")
         wait_until(lambda: "robot robotino1" in person.shown(), PATIENCE_S, "the robot is there")
         place = used(folder)
         assert place is not None

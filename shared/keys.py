@@ -12,6 +12,7 @@ request  the sender repeats it until it is answered or its deadline is over. The
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Literal
 
@@ -161,6 +162,8 @@ STREAMS: tuple[Stream, ...] = (
 
 ALIVE_PATTERN = "{run}/alive/{service}/{id}/{life}/{protocol}/{config}"
 """Liveliness token of every service: who is there, which protocol and configuration it speaks."""
+_PLAIN = re.compile(r"[A-Za-z0-9_-]{1,64}")
+"""What a part of a token may look like: strangers' parts are shown on terminals."""
 CLAIM_PATTERN = "{run}/claim/{service}/{id}/{life}"
 """Liveliness token of a process that wants a role (`shared.roles`)."""
 
@@ -186,6 +189,6 @@ class Peer:
 def parse_alive(key: str) -> Peer | None:
     """The peer behind a liveliness key, or None if it has another form."""
     chunks = key.split("/")
-    if len(chunks) != 7 or chunks[1] != "alive":
+    if len(chunks) != 7 or chunks[1] != "alive" or not all(map(_PLAIN.fullmatch, chunks[2:])):
         return None
     return Peer(*chunks[2:])

@@ -12,7 +12,7 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from shared.columns import CHANGES, EPISODE
 from shared.facts import ACTION_COUNT, ACTIONS, IMAGE_BYTES, IMAGE_SHAPE, NAME
@@ -47,7 +47,9 @@ Version = Annotated[int, Field(ge=0, lt=2**32)]
 """Of the target network: each sample keeps the one that chose its action, as uint32."""
 Stored = Annotated[int, Field(ge=0, lt=2**32)]
 """What samples keep as uint32, and numbers of actions."""
-Reason = Annotated[str, Field(max_length=1000)]
+Text = Annotated[str, AfterValidator(lambda text: "".join(map(_shown, text)))]
+"""Free text. Whatever a terminal would not show as it is, escape codes among it, is replaced."""
+Reason = Annotated[Text, Field(max_length=1000)]
 Lineage = Hash
 NO_LINEAGE = "0" * 16
 """The lineage of a memory without submissions."""
@@ -63,6 +65,10 @@ Interruption = Literal["", "pause", "estop", "late", "stop", "restart", "world",
 not fit to drive, `RobotState.reason` said why."""
 Motion = Literal["", "turn-left", "turn-right", "forward", "back"]
 """A motion that is none of the actions: turning on the spot, or creeping to another place."""
+
+
+def _shown(character: str) -> str:
+    return character if character.isprintable() else " " if character.isspace() else "?"
 
 
 class Message(BaseModel):
@@ -229,14 +235,14 @@ class Standing(Message):
     halts: Annotated[tuple[Halt, ...], Field(max_length=MAX_HALTS)]
     """Those in force as far as it knows; of a driver those that hold its robot."""
     released: Annotated[tuple[Released, ...], Field(max_length=MAX_RELEASED)] = ()
-    problem: Annotated[str, Field(max_length=300)] = ""
+    problem: Annotated[Text, Field(max_length=300)] = ""
     """Why the halts could not be kept on disk; a restart would forget them."""
 
 
 class Fault(Message):
     """One kind of fault between a driver and its robot."""
 
-    name: str
+    name: Text
     """Which part failed and how: `camera: timeout`."""
     count: Count
 
@@ -271,7 +277,7 @@ class RobotState(Message):
     """Changes of the world that were refused, at once or when they were due."""
     blocks: Count = 0
     """How often the robot was found unfit to drive."""
-    reason: Annotated[str, Field(max_length=200)] = ""
+    reason: Annotated[Text, Field(max_length=200)] = ""
     """Why it is not fit to drive now; empty when it is."""
     faults: Annotated[tuple[Fault, ...], Field(max_length=MAX_FAULTS)] = ()
     """What went wrong between driver and robot so far, the most frequent first."""
@@ -333,9 +339,9 @@ class WorldChanged(Message):
 
     accepted: bool
     """The change was carried out, or is kept until its episode."""
-    reason: str = ""
+    reason: Text = ""
     """Why it was refused; empty if accepted."""
-    world: str
+    world: Text
     """The robot's world; empty if it cannot be changed."""
     obstacles: tuple[Ident, ...]
     """Names of its obstacles."""
@@ -478,7 +484,7 @@ class RobotProgress(Message):
 class Told(Message):
     """One number that a retention strategy reports."""
 
-    name: Annotated[str, Field(max_length=64)]
+    name: Annotated[Text, Field(max_length=64)]
     value: Count
 
 
@@ -713,10 +719,10 @@ class ServiceReply(Message):
     service: Ident
     id: Ident
     life: Life
-    host: Annotated[str, Field(max_length=255)]
+    host: Annotated[Text, Field(max_length=255)]
     pid: Count
     protocol: Count
-    version: Annotated[str, Field(max_length=64)]
+    version: Annotated[Text, Field(max_length=64)]
     config: Hash
     uptime_s: Seconds
     rivals: Count
@@ -728,7 +734,7 @@ class Refusal(Message):
 
     final: bool
     """The same request will be refused again; otherwise it may be sent again after a moment."""
-    reason: Annotated[str, Field(max_length=300)]
+    reason: Annotated[Text, Field(max_length=300)]
 
 
 EpisodeAck.model_rebuild()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,14 +13,20 @@ from services.cli.options import (
     ConfigOption,
     CredentialsOption,
     EndpointOption,
+    PresetOption,
     RunDirOption,
     RunOption,
     SetOption,
+    default_folder,
     import_installed,
     load,
     reach,
 )
 from services.security.use import using
+
+if TYPE_CHECKING:
+    from services.commander.bundle import Bundle
+    from shared.config import Config
 
 DRIVING = ("pilot", "operator")
 """Credentials for driving: those of a pilot, who may send actions."""
@@ -32,12 +40,16 @@ def add_to(app: typer.Typer) -> None:
     """Add the commands."""
     for command in (drive, teleop, record, playback):
         app.command()(command)
+    app.command("bundle")(pack)
 
 
 def drive(
-    weights: Annotated[
+    network: Annotated[
         Path,
-        typer.Option(help="Folder of a run, or a .safetensors file of weights."),
+        typer.Argument(
+            metavar="NETWORK",
+            help="A bundle, the folder of a run, or a .safetensors file of weights.",
+        ),
     ],
     robot: OneRobot = None,
     actions: Annotated[int, typer.Option(min=0, help="Stop after so many; 0: never.")] = 0,
@@ -45,20 +57,69 @@ def drive(
     run_dir: RunDirOption = None,
     endpoint: EndpointOption = None,
     credentials: CredentialsOption = None,
+    preset: PresetOption = None,
     config: ConfigOption = None,
     set_: SetOption = None,
 ) -> None:
     """Let a frozen network drive a robot: nothing is learnt, nothing is stored.
 
     Where it predicts nothing good the robot turns on the spot. The shape of the network is that of
-    the run the weights come from; --config and --set stand in for a missing config.toml. --run,
-    --run-dir and --endpoint tell which run the robot belongs to.
+    its bundle or run; --config and --set stand in for a missing one. --run, --run-dir and
+    --endpoint tell which run the robot belongs to. Without a run a bundle gets a robot of its own:
+    the one that it learnt on, or that of --preset and --set.
     """
-    frozen = import_installed("services.commander.frozen", "actor")
-    network = load(None, config or frozen.configuration_of(weights), set_).network
+    bundle = import_installed("services.commander.bundle", "actor")
     command = import_installed("services.commander.drive", "actor")
-    there = reach(run, run_dir, endpoint, credentials, *DRIVING)
-    raise typer.Exit(command.run(there, network, weights, robot, actions, typer.echo))
+    found, made = bundle.look(network)
+    with ExitStack() as stack:
+        if made is None or _joins(preset, run or run_dir or endpoint):
+            there = reach(run, run_dir, endpoint, credentials, *DRIVING)
+        else:
+            there = stack.enter_context(_alone(found.path, made, preset, config, set_, run))
+        file = config or bundle.frozen.configuration_of(network)
+        shape = made.network if made else load(None, file, set_).network
+        predictor = found.predictor(shape)
+        raise typer.Exit(command.run(there, predictor, found.path, robot, actions, typer.echo))
+
+
+def _alone(
+    file: Path,
+    made: Bundle,
+    preset: str | None,
+    config: Path | None,
+    sets: list[str] | None,
+    run: str | None,
+) -> AbstractContextManager[Config]:
+    """A robot of its own for a bundle."""
+    from services.commander import bundle
+    from services.launcher.alone import alone
+
+    base = [] if preset or config else bundle.overrides(made)
+    own = load(preset, config, [*base, *(sets or [])], run or "drive")
+    bundle.refuse_misfit(file, made, own.robot)
+    return alone(own, default_folder(own))
+
+
+def _joins(preset: str | None, chosen: object) -> bool:
+    """Whether the robot is one of a run that goes on already."""
+    from shared.place import those_up
+
+    given = chosen or "CORRIDOR_BUS__ENDPOINT" in os.environ
+    return preset is None and bool(given or those_up())
+
+
+def pack(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")],
+    out: Annotated[Path, typer.Option(help="File to write, such as robot.safetensors.")],
+) -> None:
+    """Write the network of a run as a bundle, which `corridor drive` takes on any machine.
+
+    It holds the weights and what they need: shape, kind of pictures, actions, and the robot that
+    they were learnt on.
+    """
+    made = import_installed("services.commander.bundle", "actor").make(run, out)
+    origin = ", ".join(f"{name} {value}" for name, value in made.provenance.items())
+    typer.echo(f"{out}: {origin}")
 
 
 def teleop(

@@ -15,7 +15,7 @@ from typing import Any
 
 import typer
 
-from services.cli import driving, experiments, run, services
+from services.cli import driving, experiments, machines, run, services
 from services.cli.emulate import emulate
 from services.cli.options import EXIT_CONFIG, EXIT_CRASH, EXIT_ROLE, EXIT_STATE
 from services.cli.secure import secure
@@ -33,7 +33,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for group in (driving, services, run, experiments):
+for group in (machines, driving, services, run, experiments):
     group.add_to(app)
 app.add_typer(world, name="world")
 app.add_typer(obstacle, name="obstacle")

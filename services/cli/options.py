@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -148,7 +149,9 @@ def import_installed(module: str, extra: str) -> Any:
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] in {"experiments", "services", "shared"}:
             raise
+        remedy = f"pip install 'corridor[{extra}]'"
+        if error.name == "pybullet" and sys.version_info >= (3, 12):
+            remedy = "it has no wheels for this Python, use Python 3.11"
         raise ConfigError(
-            f"{extra}: needs the Python package {error.name}, which is not installed: "
-            f"pip install 'corridor[{extra}]'"
+            f"{extra}: needs the Python package {error.name}, which is not installed: {remedy}"
         ) from error

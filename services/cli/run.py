@@ -70,8 +70,8 @@ def up(
 ) -> None:
     """Start router, replay, learner, actor and driver, and show how the robot learns.
 
-    Ctrl-C stops everything within five seconds; the same command continues the run. All that a
-    run produces lies in its folder.
+    Ctrl-C stops everything within five seconds; the same command continues the run. The space key
+    is the emergency stop of all its robots. All that a run produces lies in its folder.
     """
     loaded = load(
         preset, config, set_, run, seed, endpoint, credentials, {"run.episodes": episodes}

@@ -13,9 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from services.commander import frozen
 from services.commander.commander import Commander, commanding
-from shared.config import Config, NetworkConfig
+from shared.config import Config
 from shared.facts import ACTIONS
 from shared.messages import Motion, Observation, image_array
 from shared.rl.draws import generator
@@ -105,8 +104,8 @@ class DriveTally:
 
 def run(
     config: Config,
-    network: NetworkConfig,
-    weights: Path,
+    predictor: Predictor,
+    source: Path,
     robot: str | None,
     actions: int,
     echo: Callable[[str], None],
@@ -115,8 +114,8 @@ def run(
 
     Args:
         config: How to reach the run, and its robot.
-        network: Shape of the network.
-        weights: Folder of a run, or a file of weights.
+        predictor: The network.
+        source: The file it comes from.
         robot: Which robot; None: the only one there is.
         actions: 0: until stopped.
         echo: Shows a line.
@@ -125,14 +124,11 @@ def run(
         The exit code.
 
     Raises:
-        ConfigError: No such weights, another shape of network, or another robot than there is.
-        StateError: The weights are damaged.
+        ConfigError: Another robot than there is.
         PeerMissing, RobotTaken or RouterMissing: See `commanding`.
     """
-    found = frozen.read(frozen.find(weights))
-    predictor = found.predictor(network)
     with commanding(config, robot) as commander:
-        echo(f"{commander.robot}: driven by {found.path}; Ctrl-C stops it")
+        echo(f"{commander.robot}: driven by {source}; Ctrl-C stops it")
         policy, tally = FrozenPolicy(predictor, config, commander.robot), DriveTally()
         try:
             _drive(commander, policy, tally, actions, echo)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
+from safetensors.torch import load as load_safetensors
 from safetensors.torch import save as save_safetensors
 
 from shared.config import ActorNumerics, NetworkConfig, Numerics
@@ -29,6 +30,12 @@ class Frozen:
     """As safetensors: the parameters of the target network alone."""
     episode: int | None = None
     train_steps: int | None = None
+    metadata: dict[str, str] = field(default_factory=dict)
+    """Of the file, but for what `episode` and `train_steps` tell."""
+
+    def packed(self, metadata: dict[str, str]) -> bytes:
+        """A file of weights with these metadata."""
+        return save_safetensors(load_safetensors(self.data), metadata)
 
     def predictor(self, network: NetworkConfig, numerics: Numerics | None = None) -> Predictor:
         """The network ready to predict: one image at a time unless `numerics` tell otherwise.
@@ -76,7 +83,8 @@ def read(path: Path) -> Frozen:
     """
     try:
         with safe_open(path, framework="pt") as file:
-            state = json.loads((file.metadata() or {}).get("state", "{}"))
+            metadata = dict(file.metadata() or {})
+            state = json.loads(metadata.pop("state", "{}"))
             counters = state.get("counters", {}) if isinstance(state, dict) else None
             if not isinstance(counters, dict):
                 raise ValueError("expected an object as its state")
@@ -90,4 +98,4 @@ def read(path: Path) -> Frozen:
     except (OSError, SafetensorError, ValueError) as error:
         raise StateError(f"{path}: damaged weights: {error}") from error
     episode, steps = state.get("episode"), counters.get("train_steps")
-    return Frozen(path, save_safetensors(tensors), episode, steps)
+    return Frozen(path, save_safetensors(tensors), episode, steps, metadata)

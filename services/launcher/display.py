@@ -14,6 +14,8 @@ from services.launcher.live import RunView, line, panel, warnings
 
 LINE_EVERY_S = 5.0
 """Period of the plain lines; a change of the warnings shows at once."""
+LEAST_COLUMNS, LEAST_ROWS = 70, 20
+"""In a smaller window the table would lose its end, which tells what is wrong."""
 
 
 class Display(Protocol):
@@ -30,8 +32,10 @@ class Table:
         self._live = live
 
     def show(self, view: RunView) -> None:
-        """Redraw the table."""
-        self._live.update(panel(view), refresh=True)
+        """Redraw the table, as the window is now."""
+        width, height = self._live.console.size
+        small = width < LEAST_COLUMNS or height < LEAST_ROWS
+        self._live.update(panel(view, small=small), refresh=True)
 
 
 class Lines:
@@ -55,7 +59,7 @@ class Lines:
 @contextmanager
 def display_for(output: TextIO) -> Iterator[Display]:
     """The display that suits an output."""
-    console = Console(file=output)
+    console = Console(file=output, markup=False, emoji=False)
     if not console.is_terminal:
         yield Lines(output)
         return

@@ -122,6 +122,16 @@ def _losses(view: RunView) -> Iterator[str]:
 
 def line(view: RunView) -> str:
     """Everything in one line, for logs and pipes."""
+    return " | ".join([*_parts(view), *_news(view)])
+
+
+def _news(view: RunView) -> list[str]:
+    """What is wrong, and what was done last."""
+    warned = [f"! {text}" for text in warnings(view)]
+    return [*warned, *(text for text in (view.told, view.note) if text)]
+
+
+def _parts(view: RunView) -> list[str]:
     snapshot = view.snapshot
     parts = [duration(view.uptime_s)]
     if snapshot.replay is None and snapshot.learner is None:
@@ -143,15 +153,16 @@ def line(view: RunView) -> str:
     if snapshot.learner is not None:
         learner = snapshot.learner.message
         parts += [f"weights {learner.weights_version}", f"learner {learner_doing(learner)}"]
-    parts += [f"! {text}" for text in warnings(view)]
-    return " | ".join([*parts, *(text for text in (view.told, view.note) if text)])
+    return parts
 
 
 # ---------------------------------------------------------------- live table
 
 
-def panel(view: RunView) -> RenderableType:
-    """The whole live view."""
+def panel(view: RunView, *, small: bool = False) -> RenderableType:
+    """The whole live view; small: for a window that would cut it off, what is urgent first."""
+    if small:
+        return Text("\n".join([*_news(view), *_parts(view)]))
     table = Table.grid(padding=(0, 2))
     table.add_column(style="bold", no_wrap=True)
     table.add_column()

@@ -9,7 +9,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -129,8 +129,14 @@ def _view(
     )
 
 
-def child_specs(config: Config, stored: Config, folder: Path, own: str | None) -> list[ChildSpec]:
-    """The processes of a run: our router if `own` tells where it listens, and all services."""
+def child_specs(
+    config: Config,
+    stored: Config,
+    folder: Path,
+    own: str | None,
+    services: Sequence[Process] = SERVICES,
+) -> list[ChildSpec]:
+    """The processes of a run: our router if `own` tells where it listens, and the services."""
     specs = []
     if own is not None:
         credentials = config.bus.credentials
@@ -141,7 +147,7 @@ def child_specs(config: Config, stored: Config, folder: Path, own: str | None) -
     changes = settings.differences(stored, config)
     options = [f"--set={key}={settings.toml_value(value)}" for key, _, value in changes]
     source = ("--config", str(folder / settings.FILE_NAME), "--run-dir", str(folder))
-    return [*specs, *(_spec(process, *source, *options) for process in SERVICES)]
+    return [*specs, *(_spec(process, *source, *options) for process in services)]
 
 
 def _spec(process: Process, *options: str) -> ChildSpec:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import typer
+from rich import box
 from rich.console import Console, Group, RenderableType
 from rich.table import Table
 
@@ -29,6 +30,8 @@ from shared.keys import PING, Peer
 from shared.messages import Ping, ServiceReply
 
 PING_S = 1.0
+WIDE = 78
+"""Columns that the whole table of services needs."""
 HEARTBEATS = 2.5
 """How many periods to wait for the heartbeats of those who are there."""
 
@@ -67,7 +70,8 @@ def show(config: Config, *, as_json: bool, require: Sequence[str]) -> int:
     if as_json:
         typer.echo(json.dumps(as_dict(config, entries, snapshot), indent=2))
     else:
-        Console().print(report(config, entries, snapshot))
+        console = Console(markup=False, emoji=False)
+        console.print(report(config, entries, snapshot, narrow=console.width < WIDE))
     answering = {entry.peer.service for entry in entries if entry.reply is not None}
     missing = [name for name in require if name not in answering]
     if missing:
@@ -102,21 +106,24 @@ def as_dict(config: Config, entries: Sequence[Entry], snapshot: Snapshot) -> dic
     }
 
 
-def report(config: Config, entries: Sequence[Entry], snapshot: Snapshot) -> RenderableType:
-    """Everything known, as tables."""
+def report(
+    config: Config, entries: Sequence[Entry], snapshot: Snapshot, *, narrow: bool = False
+) -> RenderableType:
+    """Everything known, as tables; narrow: for a terminal of less than `WIDE` columns."""
     title = f"run {config.run.name} at {config.bus.endpoint}"
     if not entries:
         return f"{title}: no service is alive"
-    parts: list[RenderableType] = [_services(title, entries)]
+    parts: list[RenderableType] = [_services(title, entries, narrow)]
     facts = Table.grid(padding=(0, 2))
     for row in _facts(snapshot):
         facts.add_row(*row)
     return Group(*parts, facts) if facts.row_count else Group(*parts)
 
 
-def _services(title: str, entries: Sequence[Entry]) -> Table:
-    table = Table(title=title, title_justify="left")
-    for column in ("service", "id", "pid", "up", "version", "life", "config"):
+def _services(title: str, entries: Sequence[Entry], narrow: bool) -> Table:
+    table = Table(title=title, title_justify="left", box=None if narrow else box.HEAVY_HEAD)
+    columns = ("service", "id", "pid", "up", "version", "life", "config")
+    for column in columns[: 4 if narrow else None]:
         table.add_column(column, no_wrap=True)
     for entry in entries:
         peer, reply = entry.peer, entry.reply
@@ -125,7 +132,8 @@ def _services(title: str, entries: Sequence[Entry]) -> Table:
             if reply
             else ("-", "no answer", "-")
         )
-        table.add_row(peer.service, peer.id, *told, peer.life, peer.config[:8])
+        row = (peer.service, peer.id, *told, peer.life, peer.config[:8])
+        table.add_row(*row[: len(table.columns)])
     return table
 
 

@@ -13,6 +13,7 @@ from safetensors.torch import load, save
 
 from benchmarks.robot_rig import Rig
 from benchmarks.waiting import wait_until
+from shared import settings
 from shared.bus import Bus
 from shared.config import Config
 from shared.keys import OBSERVATION
@@ -48,7 +49,7 @@ def corridor(cluster: Cluster | Rig, *words: object) -> subprocess.Popen[str]:
 
 def drive(cluster: Cluster | Rig, weights: Path, *words: object) -> subprocess.Popen[str]:
     filters = f"network.filters={cluster.config.network.filters}"
-    return corridor(cluster, "drive", "--weights", weights, "--set", filters, *words)
+    return corridor(cluster, "drive", weights, "--set", filters, *words)
 
 
 def heard(bus: Bus) -> list[Observation]:
@@ -149,3 +150,24 @@ def test_it_drives_and_turns_a_real_robot(tmp_path: Path) -> None:
             process.communicate(timeout=DEADLINE_S)
         rig.wait(lambda: rig.truth()["still_since_s"] is not None, "it stands")
         rig.stop("driver")
+
+
+def test_a_bundle_drives_with_one_command_and_no_run(tmp_path: Path, run_name: str) -> None:
+    config = make_config(run_name)
+    run = tmp_path / "run"
+    settings.claim(run, config)
+    weights_of(config, run, 0.5)
+    words = [sys.executable, "-P", "-m", "services.cli"]
+    for command in (["bundle", str(run), "--out", "robot.bundle"], ["drive", "robot.bundle"]):
+        more = ["--actions", "6"] if command[0] == "drive" else []
+        done = subprocess.run(
+            [*words, *command, *more],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=DEADLINE_S,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+    assert "6 actions, 0 turns on the spot" in done.stdout
+    assert not (tmp_path / "runs" / "drive" / "endpoint").exists()

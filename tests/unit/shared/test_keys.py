@@ -79,8 +79,13 @@ def test_liveliness_tokens_tell_who_lives() -> None:
 
 
 @pytest.mark.parametrize(
-    "key", ["", "run1/alive", "run1/alive/a/b/c/d", "run1/alive/a/b/c/d/e/f", "run1/dead/a/b/c/d/e"]
-)
+    "key",
+    [
+        "", "run1/alive", "run1/alive/a/b/c/d", "run1/alive/a/b/c/d/e/f", "run1/dead/a/b/c/d/e",
+        "run1/alive/actor/\x1b[31m/b/1/d", "run1/alive/actor/[red]/b/1/d",
+        f"run1/alive/actor/{'x' * 65}/b/1/d",
+    ],
+)  # fmt: skip
 def test_other_keys_are_no_liveliness_tokens(key: str) -> None:
     assert parse_alive(key) is None
 

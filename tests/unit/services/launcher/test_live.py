@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 from fakes import message
-from rich.console import Console
+from rich.console import Console, ConsoleDimensions
+from rich.live import Live
 
 from services.launcher.display import LINE_EVERY_S, Lines, Table, display_for
 from services.launcher.live import RunView, duration, line, panel, warnings
@@ -241,3 +242,25 @@ def test_the_display_depends_on_the_terminal(monkeypatch: pytest.MonkeyPatch) ->
         assert isinstance(display, Table)
         display.show(full())
     assert "137" in terminal.getvalue()
+
+
+def test_a_small_window_shows_what_is_urgent_first_and_texts_as_they_are() -> None:
+    seen = full(told="all stand [/] [red]")
+    console = Console(file=io.StringIO(), width=40, height=12, markup=False)
+    with console.capture() as capture:
+        console.print(panel(seen, small=True))
+    lines = capture.get().splitlines()
+    assert lines[0].startswith("all stand [/] [red]")
+    assert "episode 137" in [text.strip() for text in lines]
+    assert all(len(text) <= 40 for text in lines)
+
+
+def test_the_view_follows_the_size_of_the_window() -> None:
+    output = io.StringIO()
+    console = Console(file=output, force_terminal=True, width=40, height=12)
+    with Live(console=console, auto_refresh=False) as live:
+        Table(live).show(full())
+        assert "\u2502" not in output.getvalue()
+        console.size = ConsoleDimensions(100, 40)
+        Table(live).show(full())
+    assert "\u2502" in output.getvalue()
