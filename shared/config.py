@@ -177,6 +177,19 @@ class Ros2Config(Section):
     battery_type: Literal["BatteryState", "PowerReadings"] = "BatteryState"
 
 
+class CalibrationConfig(Section):
+    """What a real robot makes of its commands, by `corridor robot calibrate` (E31)."""
+
+    speed_m_s: float = Field(default=0.0, ge=0.0, le=3.0)
+    """Speed when told `robot.speed_m_s`; 0: not measured, as it is told."""
+    turn_rad_s: float = Field(default=0.0, ge=0.0, le=5.0)
+    """Turn rate when told `robot.turn_rad_s`, likewise."""
+    delay_s: float = Field(default=0.0, ge=0.0, le=2.0)
+    """From a command until the base begins to move."""
+    made: str = Field(default="", max_length=200)
+    """When, on which robot and with which program it was measured."""
+
+
 class RobotConfig(Section):
     """The robot, its motion, and the limits its driver enforces whatever the network says."""
 
@@ -210,6 +223,17 @@ class RobotConfig(Section):
     hardware: HardwareConfig = HardwareConfig()
     robotino: RobotinoConfig = RobotinoConfig()
     ros2: Ros2Config = Ros2Config()
+    calibration: CalibrationConfig = CalibrationConfig()
+
+    @property
+    def step_m(self) -> float:
+        """Way of an action, as far as is known."""
+        return (self.calibration.speed_m_s or self.speed_m_s) * self.period_s
+
+    @property
+    def step_rad(self) -> float:
+        """Turn of an action that turns fully, as far as is known."""
+        return (self.calibration.turn_rad_s or self.turn_rad_s) * self.period_s
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -468,7 +492,7 @@ class Config(Section):
     @property
     def max_distance_m(self) -> float:
         """Farthest reachable point within the horizon: v * dt * horizon (Eq 3.2, E31)."""
-        return self.robot.speed_m_s * self.robot.period_s * self.episode.horizon
+        return self.robot.step_m * self.episode.horizon
 
     def to_dict(self) -> dict[str, Any]:
         """The tree as plain nested dictionaries."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import Counter
@@ -11,7 +12,7 @@ import numpy as np
 
 from services.robot_driver.real.link import Battery, Newest
 from services.robot_driver.real.odometry import joined
-from services.robot_driver.robot import Pose, RobotFault, Velocity
+from services.robot_driver.robot import STANDSTILL, Pose, RobotFault, Velocity
 from shared.config import Config
 from shared.messages import ImageArray
 
@@ -87,3 +88,25 @@ def config_of(**robot: Any) -> Config:
         **robot,
     }
     return Config.model_validate({"robot": tree})
+
+
+class Plane:
+    """A body without walls."""
+
+    def __init__(self) -> None:
+        self.pose = Pose(1.0, 2.0, math.pi / 2.0)
+        self.contact = False
+        self.velocity = STANDSTILL
+
+    def drive(self, velocity: Velocity) -> None:
+        self.velocity = velocity
+
+    def run(self, duration_s: float, *, stop_on_contact: bool) -> bool:
+        h, v = self.pose.heading_rad, self.velocity
+        forward, left = v.forward_m_s * duration_s, v.left_m_s * duration_s
+        self.pose = Pose(
+            self.pose.x_m + forward * math.cos(h) - left * math.sin(h),
+            self.pose.y_m + forward * math.sin(h) + left * math.cos(h),
+            h + v.turn_rad_s * duration_s,
+        )
+        return False

@@ -171,7 +171,7 @@ class EmulatedRobotino:
 
     def _apply(self, faults: Faults) -> None:
         stalled = faults.odometry == "stalled"
-        self.robot.configure(stalled=stalled, watchdog_s=faults.watchdog_s)
+        self.robot.configure(stalled=stalled, watchdog_s=faults.watchdog_s, scale=faults.scale)
 
 
 class Handler(BaseHTTPRequestHandler):

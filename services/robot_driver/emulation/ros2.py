@@ -121,7 +121,9 @@ class EmulatedRos2:
         with self._lock:
             before, now = self._faults, self._faults.changed(changes)
             self._faults = now
-            self.robot.configure(stalled=now.odometry == "stalled", watchdog_s=now.watchdog_s)
+            self.robot.configure(
+                stalled=now.odometry == "stalled", watchdog_s=now.watchdog_s, scale=now.scale
+            )
             if now.closed_s:  # after this was answered
                 self._close_s = time.monotonic() + STEP_S
                 self._reopen_s = self._close_s + now.closed_s

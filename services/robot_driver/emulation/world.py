@@ -97,11 +97,11 @@ class EmulatedRobot:
                 commands=tuple(base.commands),
             )
 
-    def configure(self, *, stalled: bool, watchdog_s: float) -> None:
-        """Let the motors stall or turn, and set the base's watchdog."""
+    def configure(self, *, stalled: bool, watchdog_s: float, scale: float) -> None:
+        """Let the motors stall or turn, set the base's watchdog, and what it makes of commands."""
         with self._lock:
             self._base.stalled = stalled
-            self._base.configure(watchdog_s=watchdog_s)
+            self._base.configure(watchdog_s=watchdog_s, scale=scale)
 
     def picture(self, fault: str = "") -> npt.NDArray[np.uint8]:
         """What the camera sees now: uint8 [h, w, 3], RGB, with noise as of a real sensor.
