@@ -25,16 +25,18 @@ from shared import settings
 from shared.config import Config
 from shared.messages import RobotState
 
+BATTERY = "battery low, from the message that said so"
 FAULTS: dict[str, dict[str, object]] = {
     "camera frozen": {"camera": "frozen"},
     "camera 500": {"camera": "500"},
     "camera truncated": {"camera": "truncated"},
+    "camera of one colour": {"camera": "flat"},
     "odometry frozen": {"odometry": "frozen"},
     "bumper unreadable": {"bumper": "unreadable"},
     "network cut": {"network": "cut"},
     "network silent": {"network": "silent"},
     "commands refused": {"commands": "refused"},
-    "battery low": {"battery_low": True},
+    BATTERY: {"battery_low": True},
 }
 SOUND: dict[str, object] = {
     "camera": "",
@@ -47,14 +49,12 @@ SOUND: dict[str, object] = {
 
 
 def configuration() -> Config:
-    """The preset, on loopback; heartbeats and battery are looked at more often."""
+    """The preset, on loopback."""
     return settings.load(
         "robotino",
         overrides=[
             "run.name=reaction",
             f"bus.endpoint={free_endpoint()}",
-            "bus.heartbeat_s=0.2",
-            "robot.robotino.battery_period_s=0.1",
             "robot.hardware.open_timeout_s=60",
         ],
     )
@@ -69,7 +69,10 @@ def cases(rig: Rig) -> dict[str, Callable[[], float]]:
     """Return a function for each fault, which returns the time until the robot stood."""
 
     def fault(changes: dict[str, object]) -> float:
-        spent_s = rig.wait_still(rig.faults(**changes))
+        since_s = rig.faults(**changes)
+        if "battery_low" in changes:
+            since_s = rig.wait(lambda: rig.truth()["low_told_s"], "the robot says so")
+        spent_s = rig.wait_still(since_s)
         rig.faults(**SOUND)
         return spent_s
 

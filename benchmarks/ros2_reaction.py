@@ -17,6 +17,7 @@ from pathlib import Path
 from statistics import median
 
 from benchmarks.frame import Bar, Mode, mode_of, report, rounds_of, table
+from benchmarks.robot_reaction import BATTERY
 from benchmarks.ros2_rig import Ros2Rig
 from services.launcher.up import free_endpoint
 from services.robot_driver.emulation.dynamics import CREATE3, ROBOTINO, STEP_S
@@ -31,9 +32,10 @@ FAULTS: dict[str, dict[str, object]] = {
     "odometry frozen": {"odometry": "frozen"},
     "camera frozen": {"camera": "frozen"},
     "camera frozen, stamps go on": {"camera": "restamped"},
-    "bumper silent": {"bumper": "silent"},
+    "bumper muted": {"bumper": "muted"},
+    "pictures 30 s old": {"camera_late_s": 30.0},
     "truncated CDR": {"payload": "truncated"},
-    "battery low": {"battery_low": True},
+    BATTERY: {"battery_low": True},
 }
 SOUND: dict[str, object] = {
     "wrong_type": False,
@@ -41,6 +43,7 @@ SOUND: dict[str, object] = {
     "odometry": "",
     "camera": "",
     "bumper": "",
+    "camera_late_s": 0.0,
     "payload": "",
     "battery_low": False,
 }
@@ -56,7 +59,6 @@ def configuration(preset: str, transport: str) -> Config:
         overrides=[
             f"run.name=reaction-{preset}",
             f"bus.endpoint={free_endpoint()}",
-            "bus.heartbeat_s=0.2",
             f"robot.ros2.transport={transport}",
             "robot.hardware.open_timeout_s=60",
         ],
@@ -66,7 +68,7 @@ def configuration(preset: str, transport: str) -> Config:
 def allowed_s(config: Config, name: str) -> float:
     """Two control periods, or the base's watchdog, and the base's own delay and ramp."""
     robot = config.robot
-    base = CREATE3 if robot.ros2.bumper_on_change else ROBOTINO
+    base = CREATE3 if robot.ros2.bumper_type == "HazardDetectionVector" else ROBOTINO
     waits_s = max(2 * robot.period_s, CREATE3.watchdog_s if name in UNREACHED else 0.0)
     return waits_s + base.stop_time_s(action_velocity(config, 1))
 
@@ -75,7 +77,10 @@ def cases(rig: Ros2Rig) -> dict[str, Callable[[], float]]:
     """Return a function for each fault, which returns the time until the robot stood."""
 
     def fault(changes: dict[str, object]) -> float:
-        spent_s = rig.wait_still(rig.faults(**changes))
+        since_s = rig.faults(**changes)
+        if "battery_low" in changes:
+            since_s = rig.wait(lambda: rig.truth()["low_told_s"], "the robot says so")
+        spent_s = rig.wait_still(since_s)
         rig.faults(**SOUND)
         return spent_s
 

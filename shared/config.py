@@ -11,9 +11,11 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
 
 from shared.facts import DEFAULT_ENDPOINT, DEFAULT_RUN, IMAGE_HEIGHT, IMAGE_WIDTH, NAME
 from shared.rl.retention.table import STRATEGIES
@@ -107,10 +109,12 @@ class HardwareConfig(Section):
     """The robot stands still while its newest odometry is older."""
     bumper_stale_s: float = Field(default=0.5, gt=0.0, le=5.0)
     """The robot stands still while its newest bumper reading is older."""
+    battery_stale_s: float = Field(default=60.0, gt=0.0, le=3600.0)
+    """A battery that was good is unknown when its newest reading is older; a low one stays low."""
     rest_s: float = Field(default=0.7, ge=0.0, le=5.0)
-    """Time that the robot needs to come to rest after a recovery, its delay included."""
+    """Time that the robot needs to come to rest, or to begin to move, its delay included."""
     open_timeout_s: float = Field(default=10.0, gt=0.0, le=120.0)
-    """The service ends when robot and sensors have not all answered by then."""
+    """The service ends when the robot has not answered by then. Sensors may answer later."""
 
 
 class RobotinoConfig(Section):
@@ -129,9 +133,15 @@ class RobotinoConfig(Section):
     """Timeout of one request or command."""
 
 
-TOPIC = r"^[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*$"
-OPTIONAL_TOPIC = rf"^({TOPIC[1:-1]})?$"
-"""ROS names without a leading slash; they become Zenoh keys."""
+def _topic(name: str) -> str:
+    """A ROS name; it becomes a Zenoh key, so nothing in it may be a pattern."""
+    if re.fullmatch(r"(/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*)?", name):
+        return name
+    raise PydanticCustomError("ros_name", "a ROS name such as 'cmd_vel' or '/bot1/odom'")
+
+
+OptionalTopic = Annotated[str, AfterValidator(_topic)]
+Topic = Annotated[OptionalTopic, Field(min_length=1)]
 
 
 class Ros2Config(Section):
@@ -146,21 +156,37 @@ class Ros2Config(Section):
     """ROS_DOMAIN_ID, for rmw-zenoh only."""
     distribution: Literal["humble", "jazzy"] = "jazzy"
     """Humble has no type hashes in its keys. For rmw-zenoh only."""
-    namespace: str = Field(default="", pattern=OPTIONAL_TOPIC)
-    """It is put before every topic, without a leading slash."""
-    velocity_topic: str = Field(default="cmd_vel", pattern=TOPIC)
+    namespace: OptionalTopic = ""
+    """It is put before every topic. A leading slash of either means nothing."""
+    velocity_topic: Topic = "cmd_vel"
     velocity_type: Literal["auto", "Twist", "TwistStamped"] = "auto"
     """auto: the type that the robot listens for, as the network tells."""
-    odometry_topic: str = Field(default="odom", pattern=TOPIC)
-    camera_topic: str = Field(default="image_raw", pattern=TOPIC)
+    odometry_topic: Topic = "odom"
+    camera_topic: Topic = "image_raw"
     camera_type: Literal["Image", "CompressedImage"] = "Image"
-    bumper_topic: str = Field(default="bumper", pattern=TOPIC)
+    camera_clock: Literal["robot", "own"] = "robot"
+    """own: the computer that stamps the pictures has another clock than that of the odometry."""
+    bumper_topic: Topic = "bumper"
     bumper_type: Literal["Bool", "HazardDetectionVector"] = "Bool"
     bumper_on_change: bool = False
-    """The bumper is published on change only. Odometry then shows that the robot is alive."""
-    battery_topic: str = Field(default="", pattern=OPTIONAL_TOPIC)
+    """The bumper is published on change only: press it once after each start. Odometry then shows
+    that the robot is alive."""
+    battery_topic: OptionalTopic = ""
     """Empty: the robot has none."""
     battery_type: Literal["BatteryState", "PowerReadings"] = "BatteryState"
+
+
+class CalibrationConfig(Section):
+    """What a real robot makes of its commands, by `corridor robot calibrate` (E31)."""
+
+    speed_m_s: float = Field(default=0.0, ge=0.0, le=3.0)
+    """Speed when told `robot.speed_m_s`; 0: not measured, as it is told."""
+    turn_rad_s: float = Field(default=0.0, ge=0.0, le=5.0)
+    """Turn rate when told `robot.turn_rad_s`, likewise."""
+    delay_s: float = Field(default=0.0, ge=0.0, le=2.0)
+    """From a command until the base begins to move."""
+    made: str = Field(default="", max_length=200)
+    """When, on which robot and with which program it was measured."""
 
 
 class RobotConfig(Section):
@@ -196,6 +222,17 @@ class RobotConfig(Section):
     hardware: HardwareConfig = HardwareConfig()
     robotino: RobotinoConfig = RobotinoConfig()
     ros2: Ros2Config = Ros2Config()
+    calibration: CalibrationConfig = CalibrationConfig()
+
+    @property
+    def step_m(self) -> float:
+        """Way of an action, as far as is known."""
+        return (self.calibration.speed_m_s or self.speed_m_s) * self.period_s
+
+    @property
+    def step_rad(self) -> float:
+        """Turn of an action that turns fully, as far as is known."""
+        return (self.calibration.turn_rad_s or self.turn_rad_s) * self.period_s
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -454,7 +491,7 @@ class Config(Section):
     @property
     def max_distance_m(self) -> float:
         """Farthest reachable point within the horizon: v * dt * horizon (Eq 3.2, E31)."""
-        return self.robot.speed_m_s * self.robot.period_s * self.episode.horizon
+        return self.robot.step_m * self.episode.horizon
 
     def to_dict(self) -> dict[str, Any]:
         """The tree as plain nested dictionaries."""

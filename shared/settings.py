@@ -120,17 +120,33 @@ def toml_value(value: bool | int | float | str) -> str:
 
 def to_toml(config: Config) -> str:
     """The whole tree as TOML; reading it back gives an equal tree."""
+    return _toml(config.to_dict())
+
+
+def preset_text(config: Config) -> str:
+    """What differs from the defaults as TOML, as a preset has it."""
+    tree: Tree = {}
+    for key, _, value in differences(Config(), config):
+        *path, name = key.split(".")
+        table = tree
+        for chunk in path:
+            table = table.setdefault(chunk, {})
+        table[name] = value
+    return _toml(tree)
+
+
+def _toml(config: Tree) -> str:
     lines: list[str] = []
 
     def add(tree: Tree, path: str) -> None:
-        if path:
-            lines.extend(["", f"[{path}]"])
         tables = {name: value for name, value in tree.items() if isinstance(value, dict)}
+        if path and len(tables) < len(tree):
+            lines.extend(["", f"[{path}]"])
         lines.extend(f"{k} = {toml_value(v)}" for k, v in tree.items() if k not in tables)
         for name, table in tables.items():
             add(table, f"{path}.{name}" if path else name)
 
-    add(config.to_dict(), "")
+    add(config, "")
     return "\n".join(lines).lstrip("\n") + "\n"
 
 

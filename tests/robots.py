@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import dataclass
 
 from benchmarks.waiting import wait_until
@@ -83,6 +83,7 @@ def robotino() -> Iterator[Subject]:
     with robotino_server() as (emulated, address):
         config = real_time(kind="robotino", robotino={"address": address, "timeout_s": 2.0})
         with closing(make_robot(config)) as robot:
+            wait_until(lambda: fit(robot), 60, "the robot can be commanded")
             yield Subject(config, robot, lambda: emulated.robot.truth().pose, 1.0)
 
 
@@ -118,6 +119,8 @@ def ros2(velocity_type: str, **ros2: object) -> Callable[[], AbstractContextMana
         with ros2_emulator(**ros2, velocity_type=velocity_type) as emulated:
             config = real_time(kind="ros2", ros2={**ros2, "endpoint": emulated.endpoint})
             with closing(make_robot(config)) as robot:
+                if config.robot.ros2.bumper_on_change:
+                    press(emulated, robot)
                 wait_until(lambda: fit(robot), 60, "the robot can be commanded")
                 yield Subject(config, robot, lambda: emulated.robot.truth().pose, 1.0)
 
@@ -131,6 +134,18 @@ def fit(robot: Robot) -> bool:
     except NotReady:
         return False
     return True
+
+
+def press(emulated: EmulatedRos2, robot: Robot) -> None:
+    """Press and release the bumper until it was felt, as its operator does at the start."""
+
+    def felt() -> bool:
+        emulated.change({"bumper": "stuck" if emulated.faults.bumper == "" else ""})
+        with suppress(AssertionError):  # one message may be lost, and there is no other
+            wait_until(lambda: fit(robot), 2, "it was felt")
+        return fit(robot) and not robot.feel().contact
+
+    wait_until(felt, 60, "the bumper is felt")
 
 
 SUBJECTS: dict[str, Callable[[], AbstractContextManager[Subject]]] = {

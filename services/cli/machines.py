@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
 import typer
 
 from services.cli.options import (
@@ -13,11 +16,18 @@ from services.cli.options import (
     default_folder,
     load,
 )
+from shared.errors import ConfigError
+
+if TYPE_CHECKING:
+    from shared.config import Config
+
+robot = typer.Typer(help="Look at a real robot, and measure it.", no_args_is_help=True)
 
 
 def add_to(app: typer.Typer) -> None:
     """Add the commands."""
     app.command()(doctor)
+    app.add_typer(robot, name="robot")
 
 
 def doctor(
@@ -35,3 +45,70 @@ def doctor(
 
     loaded = load(preset, config, set_, endpoint=endpoint)
     raise typer.Exit(run(loaded, run_dir or default_folder(loaded)))
+
+
+@robot.command("check")
+def robot_check(
+    preset: PresetOption = None,
+    config: ConfigOption = None,
+    set_: SetOption = None,
+    seconds: Annotated[float, typer.Option(min=1.0, max=600.0, help="How long to look.")] = 5.0,
+) -> None:
+    """Connect to a robot, list every sensor, and move nothing.
+
+    The last line says that it is ready to drive, or what keeps it from that. Exit code 1 then.
+    """
+    from services.robot_driver.kinds import make_link
+    from services.robot_driver.setup.check import check
+
+    loaded = load(preset, config, set_)
+    problems = check(loaded.robot, make_link(loaded), seconds, typer.echo)
+    typer.echo(f"not ready: {len(problems)} things to mend" if problems else "ready")
+    raise typer.Exit(1 if problems else 0)
+
+
+@robot.command("calibrate")
+def robot_calibrate(
+    out: Annotated[Path, typer.Option(help="Preset to write, such as my-robot.toml.")],
+    preset: PresetOption = None,
+    config: ConfigOption = None,
+    set_: SetOption = None,
+    space_m: Annotated[
+        float, typer.Option(min=0.2, max=3.0, help="How far it may drive straight ahead.")
+    ] = 0.6,
+) -> None:
+    """Drive a robot a little, measure what it makes of its commands, and write a preset.
+
+    It needs free room: half a metre more than --space-m ahead, and half a metre around. Nothing
+    is written if it touches something or if two measurements disagree.
+    """
+    from services.robot_driver.kinds import make_link
+    from services.robot_driver.real.hardware import HardwareRobot
+    from services.robot_driver.setup.calibrate import calibrate
+    from shared.settings import preset_text
+    from shared.statefile import write_atomically
+
+    if out.exists():
+        raise ConfigError(f"--out: {out} exists already")
+    loaded = load(preset, config, set_)
+    link = make_link(loaded)
+    driven = HardwareRobot(loaded.robot, link)
+    try:
+        found = calibrate(loaded, driven, link, space_m, _made(loaded), typer.echo)
+    finally:
+        driven.close()
+    tree = loaded.robot.model_copy(update={"calibration": found})
+    calibrated = loaded.model_copy(update={"robot": tree})
+    head = f"# {found.made}\n# max_dist (Eq 3.2): {calibrated.max_distance_m:.3f} m\n\n"
+    write_atomically(out, (head + preset_text(calibrated)).encode())
+    typer.echo(f"written to {out}: use it with --preset {out}")
+
+
+def _made(config: Config) -> str:
+    """Provenance of a measurement made now."""
+    from shared.provenance import commit
+    from shared.run_record import now_utc
+
+    return (
+        f"corridor robot calibrate, {config.robot.kind} {config.robot.id}, {now_utc()}, {commit()}"
+    )

@@ -6,7 +6,6 @@ it as plain weights.
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -110,8 +109,8 @@ def of(found: frozen.Frozen) -> Bundle | None:
 def refuse_misfit(path: Path, bundle: Bundle, robot: RobotConfig) -> None:
     """Raise ConfigError for a robot that does something else with an action, or sees otherwise."""
     for what, unit, learnt, here in (
-        ("way of an action", "m", _step_m(bundle.robot), _step_m(robot)),
-        ("turn of an action", "degrees", _turn_deg(bundle.robot), _turn_deg(robot)),
+        ("way of an action", "m", bundle.robot.step_m, robot.step_m),
+        ("turn of an action", "radians", bundle.robot.step_rad, robot.step_rad),
         ("height of the camera", "m", bundle.robot.camera.height_m, robot.camera.height_m),
         (
             "vertical view of the camera",
@@ -134,14 +133,6 @@ def overrides(bundle: Bundle) -> list[str]:
     return [
         f"{key}={settings.toml_value(value)}" for key, _, value in settings.differences(base, told)
     ]
-
-
-def _step_m(robot: RobotConfig) -> float:
-    return robot.speed_m_s * robot.period_s
-
-
-def _turn_deg(robot: RobotConfig) -> float:
-    return math.degrees(robot.turn_rad_s * robot.period_s)
 
 
 def _text(value: Any) -> str:

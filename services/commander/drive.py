@@ -54,7 +54,7 @@ class FrozenPolicy:
 
     def __init__(self, network: Predictor, config: Config, robot: str) -> None:
         self._network = network
-        self._turns = SpotTurns(config.robot.turn_rad_s * config.robot.period_s)
+        self._turns = SpotTurns(config.robot.step_rad)
         self._draw = generator(config.run.seed, ROLE, robot)
 
     def choose(self, observation: Observation) -> FrozenChoice:

@@ -37,7 +37,7 @@ LIBRARIES = {
     "torch": "actor, replay, learner",
     "lmdb": "replay",
     "pybullet": "sim",
-    "httpx": "robotino",
+    "simplejpeg": "driver",
     "rosbags": "ros2",
     "openvino": "openvino",
     "cryptography": "secure",

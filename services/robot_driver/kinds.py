@@ -6,6 +6,7 @@ import importlib
 import logging
 from typing import NamedTuple
 
+from services.robot_driver.real.link import Link
 from services.robot_driver.robot import Robot, RobotFault
 from shared.config import Config
 from shared.errors import ConfigError, RobotMissing
@@ -42,18 +43,30 @@ def make_robot(config: Config) -> Robot:
     try:
         return _simulated(config) if kind == "sim" else _real(config)
     except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] in {"services", "shared"}:
-            raise
-        raise ConfigError(
-            f"driver: robot.kind {kind!r} needs the Python package {error.name}, which is not "
-            f"installed: pip install 'corridor[{REAL[kind].extra if kind in REAL else kind}]'"
-        ) from error
+        raise _missing(kind, error) from error
+
+
+def make_link(config: Config) -> Link:
+    """The way to a real robot, not opened yet.
+
+    Raises:
+        ConfigError: It is a simulated one, it cannot be reached like that, or a library is not
+            installed.
+    """
+    kind = REAL.get(config.robot.kind)
+    if kind is None:
+        raise ConfigError(f"robot.kind: expected a real robot ({', '.join(REAL)}), got 'sim'")
+    try:
+        module = importlib.import_module(f"services.robot_driver.real.{kind.module}")
+    except ModuleNotFoundError as error:
+        raise _missing(config.robot.kind, error) from error
+    link: Link = getattr(module, kind.link)(config)
+    return link
 
 
 def _real(config: Config) -> Robot:
     from services.robot_driver.real.hardware import HardwareRobot
 
-    kind = REAL[config.robot.kind]
     for name in ("camera_stale_s", "odometry_stale_s", "bumper_stale_s"):
         if getattr(config.robot.hardware, name) > 2.0 * config.robot.period_s:
             log.warning(
@@ -61,12 +74,21 @@ def _real(config: Config) -> Robot:
                 "than it could",
                 name,
             )
-    module = importlib.import_module(f"services.robot_driver.real.{kind.module}")
-    link = getattr(module, kind.link)(config)
     try:
-        return HardwareRobot(config.robot, link)
+        return HardwareRobot(config.robot, make_link(config))
     except RobotFault as error:
         raise RobotMissing(f"driver: {error}") from error
+
+
+def _missing(kind: str, error: ModuleNotFoundError) -> Exception:
+    """What to tell of a library that is not there."""
+    if (error.name or "").split(".")[0] in {"services", "shared"}:
+        return error
+    extra = REAL[kind].extra if kind in REAL else kind
+    return ConfigError(
+        f"driver: robot.kind {kind!r} needs the Python package {error.name}, which is not "
+        f"installed: pip install 'corridor[{extra}]'"
+    )
 
 
 def _simulated(config: Config) -> Robot:

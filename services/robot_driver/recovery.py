@@ -65,7 +65,8 @@ def back_off(robot: Robot, config: RobotConfig, heading_rad: float) -> float:
     """Retreat at most `recovery_distance_m`, then turn on the spot to `heading_rad` (odometry).
 
     A wall behind ends the retreat; the robot then creeps forward half the way it had won, so that
-    it does not begin its next action against that wall. It stands still afterwards.
+    it does not begin its next action against that wall. It does not where the bumper never let go:
+    nobody knows on which side it is pressed. It stands still afterwards.
 
     Returns:
         Distance between the poses before and after, metres.
@@ -112,7 +113,7 @@ def _creeping(config: RobotConfig) -> float:
 
 
 def _move(robot: Robot, config: RobotConfig, distance_m: float) -> bool:
-    """Drive straight, backwards if negative; return whether a wall ended it."""
+    """Drive straight, backwards if negative; return whether a wall on that side ended it."""
     left = abs(distance_m)
     speed = _creeping(config)
     pressed = robot.feel().contact
@@ -125,7 +126,7 @@ def _move(robot: Robot, config: RobotConfig, distance_m: float) -> bool:
             return True
         left -= part
         pressed = pressed and robot.feel().contact
-    return pressed
+    return False
 
 
 def _distance(a: Pose, b: Pose) -> float:

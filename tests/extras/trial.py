@@ -88,6 +88,14 @@ def _command(*words: str) -> Callable[[Environment], None]:
     return check
 
 
+def _without_services(environment: Environment) -> None:
+    """Configurations can be looked at, and what is missing for a run is named."""
+    _command("config", "--preset", "robotino")(environment)
+    code, said = environment.run("up", "--run", "x")
+    assert code == 2, said
+    assert "pip install 'corridor[" in said, said
+
+
 def _record(environment: Environment) -> None:
     router = environment.start("router", "--listen", environment.endpoint)
     place = ("--endpoint", environment.endpoint)
@@ -107,7 +115,7 @@ def _record(environment: Environment) -> None:
 
 UNREACHABLE = "127.0.0.1:9"
 PURPOSES: dict[str, Callable[[Environment], None]] = {
-    "driver": _command("config", "--preset", "robotino"),
+    "driver": _without_services,
     "sim": _service("driver"),
     "robotino": _service(
         "driver", "--preset", "robotino", "--set", f"robot.robotino.address={UNREACHABLE}"

@@ -67,9 +67,9 @@ def well(state: RobotState) -> bool:
         ({"camera": "frozen"}, {"camera": ""}, "camera"),
         ({"camera": "500"}, {"camera": ""}, "camera"),
         ({"camera": "truncated"}, {"camera": ""}, "camera"),
-        ({"camera": "empty"}, {"camera": ""}, "camera"),
+        ({"camera": "flat"}, {"camera": ""}, "camera"),
         ({"odometry": "frozen"}, {"odometry": ""}, "odometry"),
-        ({"odometry": "empty"}, {"odometry": ""}, "odometry"),
+        ({"odometry": "stalled"}, {"odometry": ""}, "odometry: stands"),
         ({"bumper": "unreadable"}, {"bumper": ""}, "bumper"),
         ({"bumper": "nonsense"}, {"bumper": ""}, "bumper"),
         ({"network": "cut"}, {"network": ""}, ""),
@@ -99,7 +99,7 @@ def test_the_robot_stands_while_something_is_wrong_and_goes_on_after(
 def test_faults_are_counted_by_sensor_and_reason(rig: Rig) -> None:
     rig.faults(camera="truncated")
     rig.wait_state(
-        lambda state: any(f.name == "camera: truncated" and f.count for f in state.faults),
+        lambda state: any(f.name == "camera: damaged or cut off" and f.count for f in state.faults),
         "the fault is told",
     )
     rig.faults(camera="")

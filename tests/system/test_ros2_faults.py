@@ -58,7 +58,7 @@ def rig(
 def allowed_s(rig: Ros2Rig) -> float:
     """Two control periods, the base's own delay and ramp, and slack."""
     robot = rig.config.robot
-    base = CREATE3 if robot.ros2.bumper_on_change else ROBOTINO
+    base = CREATE3 if robot.ros2.bumper_type == "HazardDetectionVector" else ROBOTINO
     velocity = Velocity(robot.speed_m_s, 0.0, robot.turn_rad_s)
     return 2 * PERIOD_S + base.stop_time_s(velocity) + SLACK_S
 
@@ -73,15 +73,15 @@ def well(state: RobotState) -> bool:
         ({"wrong_type": True}, {"wrong_type": False}, "listens for TwistStamped on cmd_vel"),
         ({"nobody_listens": True}, {"nobody_listens": False}, "nothing on the robot listens"),
         ({"odometry": "frozen"}, {"odometry": ""}, "odometry"),
-        ({"odometry": "silent"}, {"odometry": ""}, "odometry"),
+        ({"odometry": "stalled"}, {"odometry": ""}, "odometry: stands"),
         ({"camera": "frozen"}, {"camera": ""}, "camera"),
         ({"camera": "restamped"}, {"camera": ""}, "camera"),
-        ({"camera": "silent"}, {"camera": ""}, "camera"),
-        ({"bumper": "silent"}, {"bumper": ""}, "bumper"),
+        ({"camera_late_s": 30.0}, {"camera_late_s": 0.0}, "camera: nothing new"),
+        ({"bumper": "muted"}, {"bumper": ""}, "bumper"),
         ({"battery_low": True}, {"battery_low": False}, "battery: low"),
         ({"payload": "truncated"}, {"payload": ""}, ""),
         ({"payload": "truncated", "payload_of": "camera"}, {"payload": ""}, "camera"),
-        ({"payload": "truncated", "payload_of": "odometry"}, {"payload": ""}, "odometry"),
+        ({"payload": "truncated", "payload_of": "bumper"}, {"payload": ""}, "bumper"),
     ],
     ids=lambda value: "-".join(map(str, value.values())) if isinstance(value, dict) else "",
 )

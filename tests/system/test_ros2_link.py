@@ -289,19 +289,25 @@ ON_CHANGE: dict[str, object] = {
 }
 
 
-def test_a_silent_bumper_that_nobody_publishes_is_unknown(hand: Hand) -> None:
+def test_a_silent_bumper_is_unknown_whoever_publishes_it(hand: Hand) -> None:
     with linked(hand, **ON_CHANGE) as link:
         hand.listen()
         wait_obstacle(link, "")
+        wait_until(
+            lambda: link.bumper.note == "nobody publishes on hazard_detection", 60, "it says"
+        )
+        hand.publishes("hazard_detection", "HazardDetectionVector")
         for stamp_ns in (1, 2, 3):
             hand.odometry(stamp_ns)
             assert link.odometry.wait(stamp_ns - 1, PATIENCE_S)
         assert link.bumper.get() is None
+        wait_until(lambda: link.bumper.note.startswith("press it once"), 60, "what to do")
 
 
 def test_odometry_keeps_a_bumper_fresh_while_somebody_publishes_it(hand: Hand) -> None:
     with linked(hand, **ON_CHANGE) as link:
         end = hand.publishes("hazard_detection", "HazardDetectionVector")
+        hand.say("hazard_detection", cdr.encode_bumper(False, "HazardDetectionVector", 76))
         stamp_ns = 0
 
         def fresh() -> bool:

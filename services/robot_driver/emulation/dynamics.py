@@ -40,6 +40,8 @@ class BaseDynamics:
     watchdog_s: float
     """Without a command for this long the base brakes."""
     omnidirectional: bool = True
+    scale: float = 1.0
+    """Part of a command that the wheels make of it."""
 
     def stop_time_s(self, velocity: Velocity) -> float:
         """Longest time from a stop's arrival until the base stands: delay and ramp."""
@@ -187,9 +189,9 @@ class EmulatedBase:
         d = self.dynamics
         left = velocity.left_m_s if d.omnidirectional else 0.0
         return Velocity(
-            _limit(velocity.forward_m_s, d.deadband_m_s, d.max_speed_m_s),
-            _limit(left, d.deadband_m_s, d.max_speed_m_s),
-            _limit(velocity.turn_rad_s, d.deadband_rad_s, d.max_turn_rad_s),
+            _limit(d.scale * velocity.forward_m_s, d.deadband_m_s, d.max_speed_m_s),
+            _limit(d.scale * left, d.deadband_m_s, d.max_speed_m_s),
+            _limit(d.scale * velocity.turn_rad_s, d.deadband_rad_s, d.max_turn_rad_s),
         )
 
     def _ramped(self, duration_s: float) -> Velocity:

@@ -57,6 +57,7 @@ class EmulatedRobotino:
         self._last: dict[str, bytes] = {}
         """Answers that are repeated once they are frozen."""
         self._asked_s = -math.inf
+        self._low_told_s: float | None = None
         self._apply(faults)
 
     @property
@@ -81,6 +82,7 @@ class EmulatedRobotino:
         if path == "/data/odometry":
             return self._odometry(faults)
         if path == "/data/powermanagement":
+            self._tell_battery(faults.battery_low)
             return _json(
                 {
                     "batteryLow": faults.battery_low,
@@ -112,7 +114,14 @@ class EmulatedRobotino:
 
     def truth(self) -> dict[str, Any]:
         """What the robot really does, ready for JSON."""
-        return truth_tree(self.robot.truth())
+        return {**truth_tree(self.robot.truth()), "low_told_s": self._low_told_s}
+
+    def _tell_battery(self, low: bool) -> None:
+        """Remember when a low battery was first told."""
+        if not low:
+            self._low_told_s = None
+        elif self._low_told_s is None:
+            self._low_told_s = time.monotonic()
 
     def _camera(self, faults: Faults) -> Reply:
         now_s = time.monotonic()
@@ -125,7 +134,7 @@ class EmulatedRobotino:
             return HTTPStatus.OK, "image/jpeg", b""
         picture = self._kept("camera") if faults.camera == "frozen" else None
         if picture is None:
-            picture = jpeg(self.robot)
+            picture = jpeg(self.robot, faults.camera)
             self._keep("camera", picture)
         if faults.camera == "truncated":
             picture = picture[: len(picture) // 2]
@@ -162,7 +171,7 @@ class EmulatedRobotino:
 
     def _apply(self, faults: Faults) -> None:
         stalled = faults.odometry == "stalled"
-        self.robot.configure(stalled=stalled, watchdog_s=faults.watchdog_s)
+        self.robot.configure(stalled=stalled, watchdog_s=faults.watchdog_s, scale=faults.scale)
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -278,9 +287,9 @@ class RobotinoServer(ThreadingHTTPServer):
         """A connection that broke is the client's business."""
 
 
-def jpeg(robot: EmulatedRobot) -> bytes:
+def jpeg(robot: EmulatedRobot, fault: str = "") -> bytes:
     """The camera's picture as the robot's server sends it: rendered small, scaled up."""
-    large = cv2.resize(robot.picture(), (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR)
+    large = cv2.resize(robot.picture(fault), (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR)
     done, data = cv2.imencode(".jpg", large[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     assert done
     return np.asarray(data).tobytes()

@@ -88,6 +88,8 @@ class EmulatedRos2:
         self._again: deque[tuple[float, str, bytes, bytes]] = deque(maxlen=MAX_DUPLICATES)
         self._close_s, self._reopen_s = math.inf, -math.inf
         self._last_command_ns = 0
+        self._low_told_s: float | None = None
+        """When a low battery was first told."""
         try:
             self._listen = listen
             self._network = self._opened()
@@ -119,7 +121,9 @@ class EmulatedRos2:
         with self._lock:
             before, now = self._faults, self._faults.changed(changes)
             self._faults = now
-            self.robot.configure(stalled=now.odometry == "stalled", watchdog_s=now.watchdog_s)
+            self.robot.configure(
+                stalled=now.odometry == "stalled", watchdog_s=now.watchdog_s, scale=now.scale
+            )
             if now.closed_s:  # after this was answered
                 self._close_s = time.monotonic() + STEP_S
                 self._reopen_s = self._close_s + now.closed_s
@@ -133,7 +137,8 @@ class EmulatedRos2:
         """What the robot really does, and what it counted; times by the monotonic clock."""
         truth = self.robot.truth()
         commands = [{"at_s": given.at_s, **asdict(given.velocity)} for given in truth.commands]
-        return {**asdict(truth), "commands": commands, "counts": dict(self.counts)}
+        told = {"counts": dict(self.counts), "low_told_s": self._low_told_s}
+        return {**asdict(truth), "commands": commands, **told}
 
     def close(self) -> None:
         """Leave the network and free the world. May be called twice."""
@@ -233,7 +238,7 @@ class EmulatedRos2:
         with self._lock:
             faults = self._faults
         state = getattr(faults, name, "")
-        if state == "silent":
+        if state in ("silent", "muted"):
             return
         encode = self._kept.get(name) if state == "frozen" else self._message(name, faults)
         if encode is None and state == "frozen":
@@ -272,28 +277,33 @@ class EmulatedRos2:
                 now.odometry, now.velocity, stamp_ns, little_endian=little
             )
         if name == "bumper":
-            pressed = faults.bumper == "stuck" or self.robot.counted().contact
+            pressed = faults.bumper in ("stuck", "lifted") or self.robot.counted().contact
             if ros.bumper_on_change and pressed == self._told_pressed:
                 return None
             first, self._told_pressed = self._told_pressed is None, pressed
             if ros.bumper_on_change and first and not pressed:
                 return None  # it was so when the robot was switched on
+            hazard = cdr.WHEEL_DROP if faults.bumper == "lifted" else cdr.BUMP
             return lambda little: cdr.encode_bumper(
-                pressed, ros.bumper_type, stamp_ns, little_endian=little
+                pressed, ros.bumper_type, stamp_ns, hazard=hazard, little_endian=little
             )
         if name == "battery":
             if not ros.battery_topic:
                 return None
+            if not faults.battery_low:
+                self._low_told_s = None
+            elif self._low_told_s is None:
+                self._low_told_s = time.monotonic()
             battery = Battery(faults.battery_low, 13.2 if faults.battery_low else 15.1)
             return lambda little: cdr.encode_battery(
                 battery, ros.battery_type, stamp_ns, little_endian=little
             )
-        return self._camera(stamp_ns, faults)
+        return self._camera(stamp_ns - round(faults.camera_late_s * 1e9), faults)
 
     def _camera(self, stamp_ns: int, faults: Ros2Faults) -> Encode:
         picture = self._picture
         if picture is None or faults.camera != "restamped":
-            small = self.robot.picture()
+            small = self.robot.picture(faults.camera)
             size = (SCALE * small.shape[1], SCALE * small.shape[0])
             picture = np.asarray(cv2.resize(small, size, interpolation=cv2.INTER_LINEAR), np.uint8)
             self._picture = picture
@@ -307,9 +317,8 @@ class EmulatedRos2:
             jpeg, stamp_ns, form="rgb8; jpeg compressed bgr8", little_endian=little
         )
 
-    @staticmethod
-    def _now_ns() -> int:
-        return time.time_ns() + CLOCK_OFFSET_NS
+    def _now_ns(self) -> int:
+        return time.time_ns() + CLOCK_OFFSET_NS + round(self._faults.clock_step_s * 1e9)
 
 
 def run(

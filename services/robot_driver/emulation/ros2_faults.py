@@ -25,20 +25,28 @@ class Ros2Faults(FaultSet):
     """The base listens for the other type of velocity."""
     odometry: Literal["", "frozen", "silent", "stalled"] = ""
     """frozen: the same message again and again; stalled: the motors do not turn, readings go on."""
-    camera: Literal["", "frozen", "restamped", "silent"] = ""
-    """frozen: the same message again and again; restamped: the same picture with new stamps."""
-    bumper: Literal["", "stuck", "silent"] = ""
-    """stuck: pressed; silent: nobody publishes it."""
+    camera: Literal["", "frozen", "restamped", "silent", "noiseless", "flat"] = ""
+    """frozen: the same message again and again; restamped: the same picture with new stamps;
+    noiseless: equal pictures where it stands; flat: one grey alone."""
+    camera_late_s: float = Field(default=0.0, ge=0.0, le=600.0)
+    """Pictures have stamps so much older than they are."""
+    bumper: Literal["", "stuck", "silent", "muted", "lifted"] = ""
+    """stuck: pressed; silent: nobody publishes it; muted: its publisher is announced and says
+    nothing; lifted: a wheel hangs in the air, where hazards are told."""
     payload: Literal["", "truncated", "big-endian", "padded"] = ""
     """What happens to the bytes of messages; big-endian and padded ones are still good."""
-    payload_of: Literal["all", "odometry", "camera", "bumper"] = "all"
+    payload_of: Literal["all", "odometry", "camera", "bumper", "battery"] = "all"
     duplicates: bool = False
     """Every message comes a second time, a second later."""
     bare: bool = False
     """rmw_zenoh: messages come without their attachment."""
     battery_low: bool = False
+    clock_step_s: float = Field(default=0.0, ge=-3600.0, le=3600.0)
+    """The robot's clock is set by so much."""
     closed_s: float = Field(default=0.0, ge=0.0, le=60.0)
     """Leave the network for this time, then come back."""
+    scale: float = Field(default=1.0, ge=0.5, le=2.0)
+    """Part of a command that the wheels make of it."""
     watchdog_s: float = Field(default=CREATE3.watchdog_s, gt=0.0, le=5.0)
     """Time after which the base stops by itself."""
 

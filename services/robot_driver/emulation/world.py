@@ -97,17 +97,24 @@ class EmulatedRobot:
                 commands=tuple(base.commands),
             )
 
-    def configure(self, *, stalled: bool, watchdog_s: float) -> None:
-        """Let the motors stall or turn, and set the base's watchdog."""
+    def configure(self, *, stalled: bool, watchdog_s: float, scale: float) -> None:
+        """Let the motors stall or turn, set the base's watchdog, and what it makes of commands."""
         with self._lock:
             self._base.stalled = stalled
-            self._base.configure(watchdog_s=watchdog_s)
+            self._base.configure(watchdog_s=watchdog_s, scale=scale)
 
-    def picture(self) -> npt.NDArray[np.uint8]:
-        """What the camera sees now: uint8 [h, w, 3], RGB, with noise as of a real sensor."""
+    def picture(self, fault: str = "") -> npt.NDArray[np.uint8]:
+        """What the camera sees now: uint8 [h, w, 3], RGB, with noise as of a real sensor.
+
+        fault: `noiseless`, or `flat` for one grey alone.
+        """
         with self._lock:
             frame = self._body.frame()
             noise = self._noise.normal(0.0, NOISE, frame.shape[:2])
+        if fault == "flat":
+            return np.full_like(frame, 128)
+        if fault == "noiseless":
+            return frame
         noisy = frame + np.rint(noise).astype(np.int16)[..., np.newaxis]
         return np.asarray(np.clip(noisy, 0, 255), np.uint8)
 

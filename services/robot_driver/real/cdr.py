@@ -16,7 +16,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from services.robot_driver.real.link import Battery
-from services.robot_driver.real.picture import MAX_SIDE_PX, RgbImage, decoded
+from services.robot_driver.real.picture import ENCODINGS, RgbImage, decoded, raw
 from services.robot_driver.real.ros2_types import (
     FULL_NAMES,
     BatteryType,
@@ -33,15 +33,19 @@ from services.robot_driver.robot import Pose, Velocity
 from shared.errors import BadMessage
 
 T = TypeVar("T")
-BUMP, CLIFF, STALL = 1, 2, 3
-"""Kinds of hazards of a Create 3 that end an action: it touches something, stands before a step,
-or pushes against what its bumper does not feel."""
+BACKUP_LIMIT, BUMP, CLIFF, STALL, WHEEL_DROP, PROXIMITY = range(6)
+"""Kinds of hazards of a Create 3."""
 CONTACTS = frozenset({BUMP, CLIFF, STALL})
+"""Those that end an action: it touches something, stands before a step, or pushes against what its
+bumper does not feel."""
 LOW_CHARGE = 0.15
 """Part of a full battery, where a robot tells only that, below which it is low."""
+FULL = 1.05
+"""A charge above this is told in percent; full batteries may tell a little more than 1."""
+VOLTS = (1.0, 100.0)
+"""A voltage beyond these is none."""
 MAX_WAY_M = 1e6
 """Odometry beyond this is nonsense."""
-_CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1, "rgba8": 4, "bgra8": 4}
 _GREY = np.array([9798, 19235, 3735])
 """BT.601 weights of red, green and blue, in parts of 2^15."""
 
@@ -52,14 +56,18 @@ class Stamped(Generic[T]):
 
     value: T
     stamp_ns: int
+    facts: str = ""
+    """What else it tells, for people."""
 
 
 # ---------------------------------------------------------------- from the robot
 
 
-def decode_odometry(raw: bytes) -> Stamped[Pose]:
+def decode_odometry(data: bytes) -> Stamped[Pose]:
     """Pose of a nav_msgs/Odometry; heading from its quaternion. Raises BadMessage."""
-    message = decode(raw, "Odometry")
+    message = decode(data, "Odometry")
+    if message.child_frame_id.strip("/").rsplit("/", 1)[-1] in ("odom", "map", "world"):
+        raise BadMessage(f"frames are swapped: {message.child_frame_id!r:.40} is no robot")
     position, q = message.pose.pose.position, message.pose.pose.orientation
     numbers = (position.x, position.y, q.x, q.y, q.z, q.w)
     if not all(math.isfinite(number) for number in numbers):
@@ -74,79 +82,77 @@ def decode_odometry(raw: bytes) -> Stamped[Pose]:
     return Stamped(Pose(position.x, position.y, heading), stamp_ns_of(message))
 
 
-def decode_camera(raw: bytes, kind: CameraType) -> Stamped[RgbImage]:
+def decode_camera(data: bytes, kind: CameraType) -> Stamped[RgbImage]:
     """The picture of a sensor_msgs/Image or CompressedImage: uint8 [h, w, 3], RGB.
 
     Raises:
-        BadMessage: Also for an encoding that is not 8 bits grey or colour, rows whose length does
-            not fit, depth images, and pictures that break off.
+        BadMessage: Also for what `picture.py` refuses, and depth images.
     """
-    message = decode(raw, kind)
+    message = decode(data, kind)
     if kind == "CompressedImage":
         if "compressedDepth" in message.format:
             raise BadMessage("a depth image")
-        return Stamped(decoded(message.data.tobytes()), stamp_ns_of(message))
-    channels = _CHANNELS.get(message.encoding)
-    if channels is None:
-        raise BadMessage(f"unknown encoding: {message.encoding!r:.40}, known: {list(_CHANNELS)}")
-    height, width, step = int(message.height), int(message.width), int(message.step)
-    if not (0 < height <= MAX_SIDE_PX and 0 < width <= MAX_SIDE_PX):
-        raise BadMessage(f"picture of unusable size: {width}x{height}")
-    if step < width * channels or len(message.data) != step * height:
-        raise BadMessage(
-            f"rows do not fit: {width}x{height} {message.encoding}, step {step}, "
-            f"{len(message.data)} bytes"
-        )
-    rows = message.data.reshape(height, step)[:, : width * channels]
-    pixels = np.ascontiguousarray(rows).reshape(height, width, channels)
-    return Stamped(_to_rgb(pixels, message.encoding), stamp_ns_of(message))
-
-
-def _to_rgb(pixels: RgbImage, encoding: str) -> RgbImage:
-    """Pixels of one of the `_CHANNELS` as uint8 [h, w, 3], RGB."""
-    if encoding == "mono8":
-        return np.repeat(pixels, 3, axis=2)
-    order = [2, 1, 0] if encoding.startswith("bgr") else [0, 1, 2]
-    return np.ascontiguousarray(pixels[:, :, order])
+        pixels, form = decoded(message.data.tobytes()), message.format
+    else:
+        size_px, form = (int(message.width), int(message.height)), message.encoding
+        step, big_endian = int(message.step), bool(message.is_bigendian)
+        pixels = raw(form, size_px, step, big_endian, message.data)
+    facts = f"{pixels.shape[1]}x{pixels.shape[0]} {form:.40}"
+    return Stamped(pixels, stamp_ns_of(message), facts)
 
 
 def _from_rgb(rgb: RgbImage, encoding: str) -> RgbImage:
-    """An RGB picture as uint8 [h, w, channels] of an encoding; alpha is opaque."""
-    if encoding == "mono8":
-        grey = (rgb @ _GREY + (1 << 14)) >> 15
-        return np.asarray(grey[:, :, np.newaxis], np.uint8)
-    pixels = rgb[:, :, ::-1] if encoding.startswith("bgr") else rgb
-    opaque = _CHANNELS[encoding] == 4
-    return np.pad(pixels, ((0, 0), (0, 0), (0, int(opaque))), constant_values=255)
+    """An RGB picture as uint8 [h, w, bytes] of an encoding; what is neither colour is 255."""
+    size, order = ENCODINGS[encoding]
+    pixels = np.full((*rgb.shape[:2], size), 255, np.uint8)
+    grey = (rgb @ _GREY + (1 << 14)) >> 15
+    pixels[:, :, order] = rgb if len(order) == 3 else grey[:, :, np.newaxis]
+    return pixels
 
 
-def decode_bumper(raw: bytes, kind: BumperType) -> Stamped[bool]:
-    """Whether there is contact, of a std_msgs/Bool or a Create 3's hazards. Raises BadMessage."""
-    message = decode(raw, kind)
+def decode_bumper(data: bytes, kind: BumperType) -> Stamped[bool]:
+    """Whether there is contact, of a std_msgs/Bool or a Create 3's hazards.
+
+    A limit of its own to backing up and something near are no contact.
+
+    Raises:
+        BadMessage: Also where a wheel hangs in the air, because a robot that was lifted stands, and
+            for hazards that nobody knows.
+    """
+    message = decode(data, kind)
     if kind == "Bool":
         return Stamped(bool(message.data), 0)
-    pressed = any(detection.type in CONTACTS for detection in message.detections)
-    return Stamped(pressed, stamp_ns_of(message))
+    hazards = {int(detection.type) for detection in message.detections}
+    if WHEEL_DROP in hazards:
+        raise BadMessage("lifted")
+    if unknown := hazards - {*CONTACTS, BACKUP_LIMIT, PROXIMITY}:
+        raise BadMessage(f"unknown hazard: {min(unknown)}")
+    return Stamped(bool(hazards & CONTACTS), stamp_ns_of(message))
 
 
-def decode_battery(raw: bytes, kind: BatteryType) -> Stamped[Battery]:
+def decode_battery(data: bytes, kind: BatteryType, *, percent: bool = False) -> Stamped[Battery]:
     """Charge and voltage, of sensor_msgs/BatteryState or rto_msgs/PowerReadings.
 
-    Raises BadMessage. A BatteryState tells what it does not know as not-a-number.
+    A BatteryState without a battery, with a charge that is no number, or with neither charge nor
+    voltage tells nothing. percent: this robot tells percent in place of a part of one, as any
+    does that told more than `FULL`. Raises BadMessage.
     """
-    message = decode(raw, kind)
-    if kind == "PowerReadings":
-        low = bool(message.battery_low)
-    else:
-        low = 0.0 <= message.percentage < LOW_CHARGE
+    message = decode(data, kind)
     voltage = float(message.voltage)
-    sane = math.isfinite(voltage) and 0.0 < voltage < 100.0
-    return Stamped(Battery(low, voltage if sane else None), stamp_ns_of(message))
+    sane = math.isfinite(voltage) and VOLTS[0] <= voltage <= VOLTS[1]
+    if kind == "PowerReadings":
+        battery = Battery(bool(message.battery_low), voltage if sane else None)
+    else:
+        charge = float(message.percentage)
+        part = charge / 100.0 if percent or charge > FULL else min(charge, 1.0)
+        told = message.present and 0.0 <= part <= 1.0 and (part > 0.0 or sane)
+        battery = Battery(part < LOW_CHARGE if told else None, voltage if sane else None, charge)
+    return Stamped(battery, stamp_ns_of(message))
 
 
-def decode_velocity(raw: bytes, kind: VelocityType) -> Stamped[Velocity]:
+def decode_velocity(data: bytes, kind: VelocityType) -> Stamped[Velocity]:
     """A velocity command. Raises BadMessage, also unless it is finite."""
-    message = decode(raw, kind)
+    message = decode(data, kind)
     twist = message.twist if kind == "TwistStamped" else message
     velocity = Velocity(twist.linear.x, twist.linear.y, twist.angular.z)
     if not all(math.isfinite(n) for n in (*_xyz(twist.linear), *_xyz(twist.angular))):
@@ -206,7 +212,7 @@ def encode_image(
 ) -> bytes:
     """An uncompressed picture; `padding` bytes follow every row."""
     height, width = rgb.shape[:2]
-    rows = _from_rgb(rgb, encoding).reshape(height, width * _CHANNELS[encoding])
+    rows = _from_rgb(rgb, encoding).reshape(height, width * ENCODINGS[encoding][0])
     if padding:
         rows = np.pad(rows, ((0, 0), (0, padding)))
     message = new(
@@ -241,7 +247,12 @@ def encode_compressed_image(
 
 
 def encode_bumper(
-    pressed: bool, kind: BumperType, stamp_ns: int = 0, *, little_endian: bool = True
+    pressed: bool,
+    kind: BumperType,
+    stamp_ns: int = 0,
+    *,
+    hazard: int = BUMP,
+    little_endian: bool = True,
 ) -> bytes:
     """Contact as std_msgs/Bool, or as a Create 3 tells it: hazards, none when all is clear."""
     if kind == "Bool":
@@ -249,7 +260,7 @@ def encode_bumper(
     bump = new(
         "irobot_create_msgs/msg/HazardDetection",
         header=header(stamp_ns, "bump_front_center"),
-        type=BUMP,
+        type=hazard,
     )
     message = new(
         FULL_NAMES[kind],
@@ -271,7 +282,7 @@ def encode_battery(
             header=head,
             current=0.0,
             voltage=voltage,
-            battery_low=battery.low,
+            battery_low=bool(battery.low),
         )
         return encode(message, kind, little_endian)
     message = new(
@@ -283,7 +294,7 @@ def encode_battery(
         charge=math.nan,
         capacity=math.nan,
         design_capacity=math.nan,
-        percentage=LOW_CHARGE / 2.0 if battery.low else 0.8,
+        percentage={True: LOW_CHARGE / 2.0, False: 0.8, None: math.nan}[battery.low],
         power_supply_status=2,
         power_supply_health=1,
         power_supply_technology=2,

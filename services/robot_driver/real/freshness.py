@@ -1,38 +1,112 @@
-"""Whether what a sensor sends is new, as far as the message itself tells (no clock, no thread)."""
+"""Whether what a sensor sends is new, and when it was made (no clock, no thread)."""
 
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
+from collections import OrderedDict, deque
 
 import numpy as np
 import numpy.typing as npt
 
 from services.robot_driver.robot import Pose
 
-NEW_CLOCK_NS = 10_000_000_000
-"""A stamp older than the newest by more than this does not come late: the robot's clock was set
-back. By less, and what comes is not new until the clock has caught up."""
+DRIFT = 1e-3
+"""Fastest that two clocks drift apart, in seconds a second."""
+SET_BACK_ROW = 4
+"""Messages in a row below the newest stamp, ascending, after which a clock was set back."""
+SEEN_S = 2.0
+"""Stamps of the last seconds are remembered: a copy never shows that a clock was set back."""
+MAX_SEEN = 512
 MAX_SENDERS = 16
 """Publishers of one topic that are told apart; of more, the longest silent one is forgotten."""
 MOVED_M, MOVED_RAD = 0.01, 0.02
 """A camera that sees the same to the last bit after this way is frozen."""
+REST_S = 2.0
+"""A robot that stood for this long may see the same again, for the first time; then for twice as
+long each time, so that a frozen camera moves no robot on and on."""
+
+
+class RobotClock:
+    """The robot's clock against ours, from stamps and arrivals of all its messages.
+
+    The message that took the shortest way tells how far the clocks are apart. This may rise only
+    as slowly as clocks drift, so whatever takes longer is older.
+    """
+
+    def __init__(self) -> None:
+        self.settings = 0
+        """How often the robot's clock was set back."""
+        self.apart_s: float | None = None
+        """Ours less the robot's; None before the first stamp."""
+        self._at_s = 0.0
+
+    def made_s(self, stamp_ns: int, arrived_s: float) -> float:
+        """When a message was made, on our clock. Without a stamp (0): when it arrived."""
+        if stamp_ns == 0:
+            return arrived_s
+        apart_s = arrived_s - stamp_ns / 1e9
+        if self.apart_s is not None:
+            drift_s = DRIFT * max(arrived_s - self._at_s, 0.0)
+            apart_s = min(apart_s, self.apart_s + drift_s)
+        self.apart_s, self._at_s = apart_s, arrived_s
+        return min(stamp_ns / 1e9 + apart_s, arrived_s)
+
+    def set_back(self) -> None:
+        """The robot's clock was set back: what was known of it is void."""
+        self.settings, self.apart_s = self.settings + 1, None
+
+    def stamp_ns(self, now_s: float) -> int:
+        """Now on the robot's clock, never ahead of it; 0 (no stamp) before the first message."""
+        return 0 if self.apart_s is None else round((now_s - self.apart_s) * 1e9)
 
 
 class Stamps:
-    """The stamps of one topic: what repeats or is older than the newest is not new."""
+    """The stamps of one topic: what repeats or is older than the newest is not new.
 
-    def __init__(self) -> None:
+    Args:
+        clock: Of the computer that stamps this topic. Topics that share it learn of each other
+            when it was set back.
+    """
+
+    def __init__(self, clock: RobotClock) -> None:
+        self._clock = clock
+        self._settings = clock.settings
         self._newest = 0
+        self._row: list[tuple[int, float]] = []
+        """Messages since the newest that may be of a clock that was set back."""
+        self._seen: deque[tuple[int, float]] = deque(maxlen=MAX_SEEN)
+        self.copied = False
+        """Whether the message judged last was a copy of one before."""
 
-    def new(self, stamp_ns: int) -> bool:
-        """Whether a message with this stamp is newer than all before. 0: it tells no stamp."""
-        if stamp_ns == 0:
-            return True
-        if self._newest - NEW_CLOCK_NS <= stamp_ns <= self._newest:
-            return False
-        self._newest = stamp_ns
-        return True
+    def made_s(self, stamp_ns: int, arrived_s: float) -> float | None:
+        """When a message was made, on our clock; None when it repeats or comes late."""
+        if not stamp_ns:
+            return arrived_s
+        while self._seen and arrived_s - self._seen[0][1] > SEEN_S:
+            self._seen.popleft()
+        self.copied = stamp_ns == self._newest or any(stamp_ns == seen for seen, _ in self._seen)
+        if self.copied:
+            self._row = []
+            return None
+        if self._settings != self._clock.settings:
+            self._settings, self._newest = self._clock.settings, 0
+        if stamp_ns < self._newest:
+            if not self._in_order(stamp_ns, arrived_s):
+                return None
+            self._clock.set_back()
+            self._settings = self._clock.settings
+        self._newest, self._row = stamp_ns, []
+        self._seen.append((stamp_ns, arrived_s))
+        return self._clock.made_s(stamp_ns, arrived_s)
+
+    def _in_order(self, stamp_ns: int, arrived_s: float) -> bool:
+        """Whether enough late messages ascend, and no faster than they arrive: no late burst."""
+        if self._row and stamp_ns <= self._row[-1][0]:
+            self._row = []
+        self._row = [*self._row[-SET_BACK_ROW:], (stamp_ns, arrived_s)]
+        first_ns, first_s = self._row[0]
+        enough = len(self._row) >= SET_BACK_ROW
+        return enough and arrived_s - first_s >= 0.5e-9 * (stamp_ns - first_ns)
 
 
 class Sequences:
@@ -53,23 +127,33 @@ class Sequences:
 
 
 class Pictures:
-    """Tells a frozen camera that goes on stamping: the robot moved, its picture did not change.
+    """Tells a frozen camera that goes on sending: the robot moved, its picture did not change.
 
-    A robot that stands still may see the same for long, in a simulation to the last bit.
+    A robot that stands still may see the same for long, in a simulation to the last bit, and before
+    a plain wall also after it moved.
     """
 
     def __init__(self) -> None:
         self._picture: npt.NDArray[np.uint8] | None = None
         self._since: Pose | None = None
+        self._rest_s = REST_S
+        self._here: tuple[Pose, float] | None = None
+        """Where the robot stands, and since when."""
 
-    def new(self, picture: npt.NDArray[np.uint8], pose: Pose | None) -> bool:
+    def new(self, picture: npt.NDArray[np.uint8], pose: Pose | None, now_s: float) -> bool:
         """Whether the camera still sees. pose: the newest odometry, None before the first."""
+        if pose is not None and (self._here is None or _moved(self._here[0], pose)):
+            self._here = (pose, now_s)
         if self._picture is None or not np.array_equal(self._picture, picture):
-            self._picture, self._since = picture, pose
+            self._picture, self._since, self._rest_s = picture, pose, REST_S
             return True
-        if self._since is None:
-            self._since = pose
-        return pose is None or self._since is None or not _moved(self._since, pose)
+        self._since = self._since or pose
+        if pose is None or self._since is None or not _moved(self._since, pose):
+            return True
+        if self._here is None or now_s - self._here[1] < self._rest_s:
+            return False
+        self._since, self._rest_s = pose, 2.0 * self._rest_s
+        return True
 
 
 def _moved(start: Pose, end: Pose) -> bool:

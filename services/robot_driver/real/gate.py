@@ -12,7 +12,9 @@ from services.robot_driver.robot import STANDSTILL, RobotFault, Velocity
 from shared.config import RobotConfig
 
 ZEROS = 5
-"""A stop is sent at least this often: a single one can be lost."""
+"""A stop is sent at least this often, also before a robot drives back: a single one can be lost."""
+TURNING_S = 0.02
+"""Time between the stops before a robot drives back."""
 PRESSED_RECOVERIES = 2.0
 """Recovery distances that may be driven with a bumper that never lets go; then the robot waits."""
 _TOLERANCE = 1.0 + 1e-9
@@ -43,6 +45,8 @@ class Gate:
         self._until_s = -math.inf
         self._pressed_m = 0.0
         self._last: Velocity | None = None
+        self._motion = STANDSTILL
+        """The last velocity of motion that was sent."""
         self._last_s = -math.inf
         self._next_s = -math.inf
         self._zeros = 0
@@ -113,7 +117,14 @@ class Gate:
         elif self.pressed:
             speed = math.hypot(self._wanted.forward_m_s, self._wanted.left_m_s)
             blocked |= speed > self._config.recovery_speed_m_s * _TOLERANCE
-        return STANDSTILL if blocked else self._wanted
+        return STANDSTILL if blocked or self._turning else self._wanted
+
+    @property
+    def _turning(self) -> bool:
+        """Whether the robot is to drive the other way and was not stopped often enough before."""
+        motion, wanted = self._motion, self._wanted
+        along = motion.forward_m_s * wanted.forward_m_s + motion.left_m_s * wanted.left_m_s
+        return along < 0.0 and self._zeros > 0
 
     def due(self, now_s: float) -> Velocity | None:
         """What is to be sent now; None: nothing yet.
@@ -134,7 +145,10 @@ class Gate:
         if moved and not self._regardless:
             self._still_s = now_s + self._config.hardware.rest_s
         self._last = velocity
-        self._next_s = now_s + self._config.hardware.command_period_s
+        period_s = self._config.hardware.command_period_s
+        self._next_s = now_s + (min(TURNING_S, period_s) if self._turning else period_s)
+        if velocity.moving:
+            self._motion = velocity
         if arrived and not velocity.moving:
             self._zeros -= 1
 

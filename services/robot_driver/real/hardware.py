@@ -11,11 +11,11 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from services.robot_driver.real.gate import ZEROS, Gate
-from services.robot_driver.real.link import Link, Reading
-from services.robot_driver.real.odometry_frame import OdometryFrame
+from services.robot_driver.real.link import Link, Newest, Reading
+from services.robot_driver.real.odometry import MotionWatch, OdometryFrame
 from services.robot_driver.robot import (
     STANDSTILL,
     Felt,
@@ -32,6 +32,8 @@ TICK_S = 0.01
 """How often lease, sensors and bumper are looked at while the robot moves."""
 REFUSALS = 3
 """Failed commands in a row after which the robot counts as not fit to drive."""
+READING_S = 3.0
+"""Longest that a start waits for readings; without them it goes on, and the robot stands."""
 CLOSING_S = 3.0
 """Longest that `close` tries to send its stops."""
 T = TypeVar("T")
@@ -47,7 +49,7 @@ class HardwareRobot(Robot):
         clock: Monotonic seconds, as the link stamps its readings with.
 
     Raises:
-        RobotFault: The robot and its sensors did not all answer in time.
+        RobotFault: The robot did not answer in time. Sensors may answer later.
     """
 
     def __init__(
@@ -57,7 +59,12 @@ class HardwareRobot(Robot):
         self._gate = Gate(config)
         self._changed = threading.Condition()
         """Guards the gate and everything below; told when something must be sent."""
-        self._frame = OdometryFrame()
+        self._frame, self._motion = OdometryFrame(), MotionWatch(config.hardware.rest_s)
+        self._pose, self._pose_number = Pose(0.0, 0.0, 0.0), 0
+        self._driven = STANDSTILL
+        """The velocity that the robot follows, as far as is known."""
+        self._low = False
+        """The battery was low when it was last known."""
         self._unsent, self._unsent_reason = 0, ""
         self._closing = self._closed = False
         self._due_s = clock()
@@ -79,17 +86,28 @@ class HardwareRobot(Robot):
         faults = Counter(dict(self._link.faults))
         faults["command: lease expired"] = self._gate.lease_stops
         faults["odometry: jumped"] = self._frame.jumps
+        fitted = self._link.battery.note or self._link.battery.get()
+        faults["battery: unknown"] = int(bool(fitted) and self.battery_low() is None)
         return +faults
+
+    def battery_low(self) -> bool | None:
+        """Whether the battery is low; None: nobody knows. A low one stays low until it is good."""
+        reading, old_s = self._link.battery.get(), self._config.hardware.battery_stale_s
+        if reading is not None and reading.value.low is not None:
+            self._low = reading.value.low
+            if self._clock() - reading.stamp_s <= old_s:
+                return self._low
+        return self._low or None
 
     def sense(self) -> Sensed:
         """The newest picture, odometry and bumper. Raises NotReady when the robot is not fit."""
         felt = self.feel()
-        return Sensed(felt.pose, felt.contact, _there(self._link.camera.get()))
+        return Sensed(felt.pose, felt.contact, _there("camera", self._link.camera.get()))
 
     def feel(self) -> Felt:
         """The newest odometry and bumper. Raises NotReady when the robot is not fit to drive."""
         self._check()
-        return Felt(self._pose(), _there(self._link.bumper.get()))
+        return Felt(self._pose, _there("bumper", self._link.bumper.get()))
 
     def drive(self, velocity: Velocity) -> None:
         """Set the velocity, leased until `run` renews it.
@@ -180,47 +198,48 @@ class HardwareRobot(Robot):
 
     def _problem(self, now_s: float) -> str:
         """Why the robot must not move now; empty when it may."""
+        self._look(now_s)
         link, ages = self._link, self._config.hardware
         for name, reading, oldest_s in (
             ("camera", link.camera.get(), ages.camera_stale_s),
             ("odometry", link.odometry.get(), ages.odometry_stale_s),
             ("bumper", link.bumper.get(), ages.bumper_stale_s),
         ):
+            note = getattr(link, name).note
+            why = f": {note}" if note else ""
             if reading is None:
-                return f"{name}: no reading yet"
+                return f"{name}: no reading{why}"
             if now_s - reading.stamp_s > oldest_s:
-                return f"{name}: nothing new for more than {oldest_s:g} s"
-        battery = link.battery.get()
-        if battery is not None and battery.value.low:
+                return f"{name}: nothing new for more than {oldest_s:g} s{why}"
+        if self.battery_low():
             return "battery: low"
         if obstacle := link.obstacle():
             return obstacle
         if self._unsent >= REFUSALS:
             return f"command: does not get through: {self._unsent_reason}"
-        return ""
+        return self._motion.problem(now_s)
 
-    def _pose(self) -> Pose:
-        reading = self._link.odometry.get()
-        assert reading is not None, "checked before"
-        return self._frame.pose(reading.value, reading.stamp_s)
+    def _look(self, now_s: float) -> None:
+        """Compare the newest odometry with what the robot was told."""
+        self._motion.told(self._driven, now_s, pressed=self._gate.pressed)
+        reading, pushed = self._link.odometry.get(), self._motion.pushed
+        if reading is None or reading.number == self._pose_number:
+            return
+        self._pose = self._frame.pose(reading.value, reading.stamp_s)
+        self._pose_number = reading.number
+        self._motion.moved(self._pose, reading.stamp_s, now_s)
+        if self._motion.pushed and not pushed:
+            self._gate.stop()  # who else drives it gets five stops against that
 
     # ------------------------------------------------------------ threads
 
     def _open(self) -> None:
         self._link.open()
-        limit_s = self._clock() + self._config.hardware.open_timeout_s
-        for name, slot in (
-            ("odometry", self._link.odometry),
-            ("bumper", self._link.bumper),
-            ("camera", self._link.camera),
-        ):
-            if slot.wait(0, max(limit_s - self._clock(), 0.0)) is None:
-                faults = Counter(dict(self._link.faults))  # its threads go on counting
-                seen = ", ".join(f"{fault} ({n})" for fault, n in faults.most_common(3))
-                raise RobotFault(
-                    f"robot: no {name} within robot.hardware.open_timeout_s "
-                    f"({self._config.hardware.open_timeout_s:g} s)" + (f"; {seen}" if seen else "")
-                )
+        limit_s = self._clock() + READING_S
+        slots: tuple[Newest[Any], ...]
+        slots = (self._link.odometry, self._link.bumper, self._link.camera)
+        for slot in slots:
+            slot.wait(0, max(limit_s - self._clock(), 0.0))
 
     def _watch(self) -> None:
         """Let the gate know of every reading of the bumper as soon as it comes."""
@@ -230,10 +249,13 @@ class HardwareRobot(Robot):
             if reading is None:
                 continue
             number = reading.number
-            with self._changed:
-                self._gate.feel(reading.value, self._clock())
-                if reading.value:
-                    self._changed.notify_all()
+            self._touched(reading.value)
+
+    def _touched(self, pressed: bool) -> None:
+        with self._changed:
+            self._gate.feel(pressed, self._clock())
+            if pressed:
+                self._changed.notify_all()
 
     def _send(self) -> None:
         """Send what the gate lets through, until the last stop is sent."""
@@ -245,21 +267,21 @@ class HardwareRobot(Robot):
                     deadline_s = min(deadline_s, now_s + CLOSING_S / 2.0)
                     if self._gate.silent or now_s > deadline_s:
                         return
-                if self._gate.wants_motion:
-                    self._gate.problem = self._problem_or_none(now_s)
-                velocity = self._gate.due(now_s)
+                velocity = self._due(now_s)
                 if velocity is None:
                     self._changed.wait(TICK_S if self._busy else 0.1)
                     continue
             self._hand_over(velocity)
 
-    def _problem_or_none(self, now_s: float) -> str:
-        """As `_problem`; a link that cannot even say is a problem, and no end of the sender."""
-        try:
-            return self._problem(now_s)
-        except Exception as error:
-            log.exception("looking at the robot failed")
-            return f"link: {type(error).__name__}: {error}"
+    def _due(self, now_s: float) -> Velocity | None:
+        """What the gate wants sent now; a link that cannot even say how it is lets nothing move."""
+        if self._gate.wants_motion:
+            try:
+                self._gate.problem = self._problem(now_s)
+            except Exception as error:
+                log.exception("looking at the robot failed")
+                self._gate.problem = f"link: {type(error).__name__}: {error}"
+        return self._gate.due(now_s)
 
     @property
     def _busy(self) -> bool:
@@ -278,6 +300,8 @@ class HardwareRobot(Robot):
         with self._changed:
             self._unsent = self._unsent + 1 if reason else 0
             self._unsent_reason = reason
+            if not reason or not velocity.moving:
+                self._driven = velocity
             self._gate.sent(velocity, self._clock(), arrived=not reason)
 
     def _send_zeros(self) -> None:
@@ -285,6 +309,7 @@ class HardwareRobot(Robot):
             self._hand_over(STANDSTILL)
 
 
-def _there(reading: Reading[T] | None) -> T:
-    assert reading is not None, "checked before"
+def _there(name: str, reading: Reading[T] | None) -> T:
+    if reading is None:
+        raise NotReady(f"{name}: no reading")  # it became void just now
     return reading.value

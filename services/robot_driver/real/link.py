@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
 from services.robot_driver.robot import Pose, Velocity
@@ -19,14 +19,16 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Reading(Generic[T]):
-    """A reading and when it was new."""
+    """A reading and when it was made."""
 
     value: T
     stamp_s: float
-    """Monotonic clock of this computer, when the reading arrived. A reading that tells its own
-    sequence number or stamp and repeats it did not arrive again."""
+    """When it was made, on the monotonic clock of this computer: the start of the request, or the
+    stamp of the robot on our clock. What a robot repeats was not made again."""
     number: int
     """1 for the first reading of the slot, growing."""
+    facts: str = ""
+    """What people may want to know: encoding and size of a picture, how long it was on its way."""
 
 
 class Newest(Generic[T]):
@@ -35,16 +37,24 @@ class Newest(Generic[T]):
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._reading: Reading[T] | None = None
+        self._count = 0
+        self.note = ""
+        """Why there is no newer reading, as far as the link knows; empty when all is well."""
 
-    def put(self, value: T, stamp_s: float) -> None:
+    def put(self, value: T, stamp_s: float, facts: str = "") -> None:
         """Replace the reading; called by the link, from any thread."""
         with self._changed:
-            number = self._reading.number + 1 if self._reading else 1
-            self._reading = Reading(value, stamp_s, number)
+            self._count += 1
+            self._reading, self.note = Reading(value, stamp_s, self._count, facts), ""
             self._changed.notify_all()
 
+    def void(self, note: str) -> None:
+        """Forget the reading: what came since could not be read, so nothing is known any more."""
+        with self._changed:
+            self._reading, self.note = None, note
+
     def get(self) -> Reading[T] | None:
-        """The newest reading; None before the first."""
+        """The newest reading; None before the first, and after `void`."""
         with self._changed:
             return self._reading
 
@@ -62,9 +72,12 @@ class Newest(Generic[T]):
 class Battery:
     """What the robot says of its battery."""
 
-    low: bool
+    low: bool | None
+    """None where the robot does not tell, or tells what means nothing."""
     voltage_v: float | None
     """None where the robot does not tell, or tells nonsense."""
+    charge: float | None = field(default=None, compare=False)
+    """As told, a part of a full one or percent; None where the robot tells none."""
 
 
 class Link(Protocol):
@@ -75,13 +88,16 @@ class Link(Protocol):
     odometry: Newest[Pose]
     """As the robot counts it, in metres and radians."""
     bumper: Newest[bool]
-    """True: pressed. A failed read puts nothing."""
+    """True: pressed. What cannot be read voids it; a read that fails puts nothing."""
     battery: Newest[Battery]
     faults: Counter[str]
     """Failed reads and writes, by what failed: `camera: status 500`, `bumper: timeout`."""
 
     def open(self) -> None:
-        """Connect and begin to read. Raises RobotFault when no robot answers in time."""
+        """Connect and begin to read. Raises RobotFault when no robot answers in time.
+
+        Readings may come later or never: the robot stands without them, and says so.
+        """
 
     def obstacle(self) -> str:
         """Why the robot cannot be commanded now, in one line; empty when it can."""

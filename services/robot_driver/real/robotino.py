@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
-import hashlib
+import http.client
 import json
 import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
-from typing import Final
-
-import httpx
+from http import HTTPStatus
+from typing import Any
 
 from services.robot_driver.real import robotino_replies as replies
+from services.robot_driver.real.freshness import Pictures
+from services.robot_driver.real.http_call import Connection
 from services.robot_driver.real.link import Battery, Newest
-from services.robot_driver.real.robotino_replies import BadReply
+from services.robot_driver.real.picture import decoded
 from services.robot_driver.robot import Pose, RobotFault, Velocity
 from shared.config import Config
-from shared.errors import ConfigError
+from shared.errors import BadMessage, ConfigError
 from shared.messages import ImageArray
+from shared.rl.preprocess import preprocess
 
 log = logging.getLogger(__name__)
 
 SERVER_SPEED_M_S, SERVER_TURN_RAD_S = 2.0, 3.0
 """The robot's server refuses faster commands instead of cutting them."""
-LABEL: Final = {"sid": "corridor"}
+LABEL = "?sid=corridor"
 """Names this client to the robot; it needs no login."""
 
 
@@ -40,53 +41,46 @@ class RobotinoLink:
     """
 
     def __init__(self, config: Config) -> None:
-        robotino = config.robot.robotino
-        self._config = robotino
-        self._address = f"http://{robotino.address}"
+        self._config = robotino = config.robot.robotino
+        self._open_timeout_s = config.robot.hardware.open_timeout_s
         self.camera: Newest[ImageArray] = Newest()
         self.odometry: Newest[Pose] = Newest()
         self.bumper: Newest[bool] = Newest()
         self.battery: Newest[Battery] = Newest()
         self.faults: Counter[str] = Counter()
         self._counting = threading.Lock()
-        self._done = threading.Event()
+        self._answered, self._done = threading.Event(), threading.Event()
         self._threads: list[threading.Thread] = []
-        self._command_s = min(robotino.timeout_s, config.robot.hardware.command_period_s)
         port = robotino.address.rpartition(":")[2]
         if port.isdecimal() and int(port) > 65535:
             raise ConfigError(
                 f"robot.robotino.address: expected a port up to 65535, got {robotino.address!r}"
             )
-        self._commands = self._client(self._command_s)
+        command_s = min(robotino.timeout_s, config.robot.hardware.command_period_s)
+        self._commands = Connection(robotino.address, command_s)
         self._sequence: int | None = None
-        self._picture = b""
+        self._pictures = Pictures()
 
     def open(self) -> None:
-        """Begin to read; the robot may answer later."""
-        logging.getLogger("httpx").setLevel(logging.WARNING)  # a line for each of 30 a second
+        """Begin to read. Raises RobotFault when nothing at all is answered in time."""
         c = self._config
-        for name, path, period_s, limit, take in (
-            (
-                "camera",
-                "/cam0",
-                c.camera_period_s,
-                replies.MAX_JPEG_BYTES,
-                self._take_picture,
-            ),
-            ("odometry", "/data/odometry", c.sensor_period_s, *self._json(self._take_odometry)),
-            ("bumper", "/data/bumper", c.sensor_period_s, *self._json(self._take_bumper)),
-            (
-                "battery",
-                "/data/powermanagement",
-                c.battery_period_s,
-                *self._json(self._take_battery),
-            ),
+        for name, path, period_s, limit in (
+            ("camera", "/cam0", c.camera_period_s, replies.MAX_JPEG_BYTES),
+            ("odometry", "/data/odometry", c.sensor_period_s, replies.MAX_JSON_BYTES),
+            ("bumper", "/data/bumper", c.sensor_period_s, replies.MAX_JSON_BYTES),
+            ("battery", "/data/powermanagement", c.battery_period_s, replies.MAX_JSON_BYTES),
         ):
-            thread = threading.Thread(
-                target=self._poll, args=(name, path, period_s, limit, take), name=name, daemon=True
-            )
+            polled = (name, path + LABEL, period_s, limit)
+            thread = threading.Thread(target=self._poll, args=polled, name=name, daemon=True)
             self._threads.append(thread)
             thread.start()
+        if not self._answered.wait(self._open_timeout_s):
+            with self._counting:
+                seen = ", ".join(f"{fault} ({n})" for fault, n in self.faults.most_common(3))
+            raise RobotFault(
+                f"robot: no answer from {c.address} within robot.hardware.open_timeout_s "
+                f"({self._open_timeout_s:g} s); {seen}"
+            )
 
     def obstacle(self) -> str:
         """Empty: a Robotino takes commands whenever it answers."""
@@ -101,100 +95,82 @@ class RobotinoLink:
         )
         try:
             content = json.dumps(wanted, allow_nan=False).encode()
-            status = self._put(content)
-        except (httpx.HTTPError, httpx.StreamError, ValueError, RuntimeError) as error:
+            path, limit = "/data/omnidrive" + LABEL, replies.MAX_JSON_BYTES
+            status, _ = self._commands.call("PUT", path, content, limit, whole=False)
+        except (OSError, http.client.HTTPException, ValueError) as error:
             raise self._fault("command", _reason(error)) from error
-        if status != httpx.codes.OK:
+        if status != HTTPStatus.OK:
             raise self._fault("command", f"status {status}")
-
-    def _put(self, content: bytes) -> int:
-        """Send a command; the status is answer enough, its body is read only while it comes."""
-        headers = {"Content-Type": "application/json"}
-        end_s, size = time.monotonic() + self._command_s, 0
-        with self._commands.stream(
-            "PUT", "/data/omnidrive", params=LABEL, content=content, headers=headers
-        ) as reply:
-            for chunk in reply.iter_raw():  # to its end, so that the connection stays open
-                size += len(chunk)
-                if size > replies.MAX_JSON_BYTES or time.monotonic() > end_s:
-                    break
-            return reply.status_code
 
     def close(self) -> None:
         """Stop reading and disconnect. May be called twice."""
         self._done.set()
         for thread in self._threads:
-            thread.join(4.0 * self._config.timeout_s + 1.0)
+            thread.join(self._config.timeout_s + 1.0)
         self._commands.close()
 
     # ------------------------------------------------------------ reading
 
-    @staticmethod
-    def _json(take: Callable[[bytes], None]) -> tuple[int, Callable[[bytes], None]]:
-        return replies.MAX_JSON_BYTES, take
-
-    def _poll(
-        self, name: str, path: str, period_s: float, limit: int, take: Callable[[bytes], None]
-    ) -> None:
+    def _poll(self, name: str, path: str, period_s: float, limit: int) -> None:
         """Read one sensor for ever, each time a period after the last began."""
-        with self._client(self._config.timeout_s) as client:
-            due_s = time.monotonic()
-            while not self._done.wait(max(due_s - time.monotonic(), 0.0)):
-                due_s = max(due_s + period_s, time.monotonic())
-                try:
-                    take(self._fetch(client, path, limit))
-                except BadReply as error:
-                    self._fault(name, str(error))
-                except (httpx.HTTPError, httpx.StreamError, RuntimeError) as error:
-                    self._fault(name, _reason(error))
-                except Exception as error:  # one odd answer must not end all reading
-                    log.exception("%s: could not be read", name)
-                    self._fault(name, type(error).__name__)
+        connection = Connection(self._config.address, self._config.timeout_s)
+        due_s = time.monotonic()
+        while not self._done.wait(max(due_s - time.monotonic(), 0.0)):
+            began_s = time.monotonic()
+            due_s = max(due_s + period_s, began_s)
+            try:
+                status, body = connection.call("GET", path, None, limit, whole=True)
+            except (OSError, http.client.HTTPException, ValueError) as error:
+                self._refuse(name, _reason(error), void=False)
+            else:
+                self._answered.set()
+                self.take(name, status, body if len(body) <= limit else None, began_s)
+        connection.close()
 
-    def _fetch(self, client: httpx.Client, path: str, limit: int) -> bytes:
-        """The body of one answer, at most `limit` bytes of it. Raises BadReply, HTTPError."""
-        body = bytearray()
-        end_s = time.monotonic() + 4.0 * self._config.timeout_s
-        with client.stream("GET", path, params=LABEL) as reply:
-            if reply.status_code != httpx.codes.OK:
-                raise BadReply(f"status {reply.status_code}")
-            for chunk in reply.iter_bytes():
-                body += chunk
-                if len(body) > limit:
-                    raise BadReply("too large")
-                if time.monotonic() > end_s:
-                    raise BadReply("timeout")
-        return bytes(body)
+    def take(self, name: str, status: int, body: bytes | None, began_s: float) -> None:
+        """Take one answer (None: it was too large) to a request that began at `began_s`.
 
-    def _take_picture(self, body: bytes) -> None:
-        """A picture equal to the last one, byte by byte, is the last one: sensors have noise."""
-        digest = hashlib.blake2b(body, digest_size=16).digest()
-        if digest != self._picture:
-            self.camera.put(replies.camera(body), time.monotonic())
-            self._picture = digest
+        An answer that cannot be read ends what was read before of bumper and battery.
+        """
+        try:
+            if status != HTTPStatus.OK:
+                raise BadMessage(f"status {status}")
+            if body is None:
+                raise BadMessage("too large")
+            getattr(self, f"_take_{name}")(body, began_s)
+        except BadMessage as error:
+            self._refuse(name, str(error), void=name in ("bumper", "battery"))
+        except Exception as error:  # one odd answer must not end all reading
+            log.exception("%s: could not be read", name)
+            self._refuse(name, type(error).__name__, void=True)
 
-    def _take_odometry(self, body: bytes) -> None:
+    def _take_camera(self, body: bytes, began_s: float) -> None:
+        picture, here = decoded(body), self.odometry.get()
+        if not self._pictures.new(picture, here.value if here else None, began_s):
+            raise BadMessage("the same picture although the robot moved")
+        facts = f"{picture.shape[1]}x{picture.shape[0]} jpeg"
+        self.camera.put(preprocess(picture), began_s, facts)
+
+    def _take_odometry(self, body: bytes, began_s: float) -> None:
         """Odometry with the sequence number of the last one is no new reading."""
         pose, sequence = replies.odometry(body)
         if sequence != self._sequence:
             self._sequence = sequence
-            self.odometry.put(pose, time.monotonic())
+            self.odometry.put(pose, began_s)
 
-    def _take_bumper(self, body: bytes) -> None:
-        self.bumper.put(replies.bumper(body), time.monotonic())
+    def _take_bumper(self, body: bytes, began_s: float) -> None:
+        self.bumper.put(replies.bumper(body), began_s)
 
-    def _take_battery(self, body: bytes) -> None:
-        self.battery.put(replies.battery(body), time.monotonic())
+    def _take_battery(self, body: bytes, began_s: float) -> None:
+        self.battery.put(replies.battery(body), began_s)
 
-    def _client(self, timeout_s: float) -> httpx.Client:
-        """A connection of its own that is kept open; proxies of the environment are not asked."""
-        return httpx.Client(
-            base_url=self._address,
-            timeout=timeout_s,
-            limits=httpx.Limits(max_connections=1, max_keepalive_connections=1),
-            trust_env=False,
-            follow_redirects=False,
-        )
+    def _refuse(self, name: str, why: str, *, void: bool) -> None:
+        """Count what was no reading, and let its slot say why."""
+        slot: Newest[Any] = getattr(self, name)
+        self._fault(name, why.split(":")[0])
+        if void:
+            slot.void(why)
+        slot.note = why
 
     def _fault(self, name: str, reason: str) -> RobotFault:
         with self._counting:
@@ -203,11 +179,9 @@ class RobotinoLink:
 
 
 def _reason(error: Exception) -> str:
-    if isinstance(error, httpx.TimeoutException):
+    if isinstance(error, TimeoutError):
         return "timeout"
-    if isinstance(error, httpx.NetworkError):
-        return "no connection"
-    return "broken answer"
+    return "no connection" if isinstance(error, OSError) else "broken answer"
 
 
 def _cut(value: float, most: float) -> float:

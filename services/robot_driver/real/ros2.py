@@ -8,77 +8,40 @@ robot says counts only while it is fresh: liveliness tokens tell types, never th
 from __future__ import annotations
 
 import logging
-import math
 import secrets
 import threading
 import time
-from collections import Counter
-from collections.abc import Callable
-from typing import Literal, cast
+from typing import cast
 
 from services.robot_driver.real import cdr, ros2_names, ros2_types
-from services.robot_driver.real.freshness import Pictures, Sequences, Stamps
-from services.robot_driver.real.link import Battery, Newest
-from services.robot_driver.real.ros2_names import Attachment, Endpoint
+from services.robot_driver.real.ros2_names import Attachment
+from services.robot_driver.real.ros2_sensors import SENSORS, Ros2Sensors
 from services.robot_driver.real.ros2_types import VelocityType
-from services.robot_driver.robot import Pose, RobotFault, Velocity
+from services.robot_driver.robot import RobotFault, Velocity
 from shared.config import Config
-from shared.errors import BadMessage, RouterMissing
-from shared.foreign_bus import ForeignBus, RawInbox, RawPublisher, RawSample
-from shared.messages import ImageArray
-from shared.rl.preprocess import preprocess
+from shared.errors import RouterMissing
+from shared.foreign_bus import ForeignBus, RawInbox, RawPublisher
 
 log = logging.getLogger(__name__)
-Sensor = Literal["bumper", "odometry", "battery", "camera"]
 KEPT = {"bumper": 64, "odometry": 1, "battery": 1, "camera": 1}
 """Samples that wait to be decoded: of the bumper all, a short touch counts; else the newest."""
-TOUCH_S = 0.03
-"""A touch is shown at least this long, so that whoever watches the slot sees it."""
 TICK_S = 0.1
 """Longest that the link's thread waits for the network."""
 RETRY_S = 0.1
 _S_NS = 1_000_000_000
 
 
-class Ros2Link:
+class Ros2Link(Ros2Sensors):
     """A ROS 2 robot as `link.Link`.
-
-    A bumper that is published on change alone is silent for hours. It counts as released from the
-    start when the network tells that somebody publishes it, and every new odometry then shows that
-    the robot still talks and had nothing new to tell. Without such a publisher its bumper is
-    unknown until it is first heard, and the robot does not drive.
 
     Args:
         config: `robot.ros2` says where the robot is and what its topics are called.
     """
 
     def __init__(self, config: Config) -> None:
-        self._ros, self._hardware = config.robot.ros2, config.robot.hardware
-        self.camera: Newest[ImageArray] = Newest()
-        self.odometry: Newest[Pose] = Newest()
-        self.bumper: Newest[bool] = Newest()
-        self.battery: Newest[Battery] = Newest()
-        self.faults: Counter[str] = Counter()
-        parts = ("velocity", "bumper", "odometry", "camera", "battery")
-        topics = {part: getattr(self._ros, f"{part}_topic") for part in parts}
-        self._topics = {part: self._topic(topic) for part, topic in topics.items() if topic}
-        self._kinds: dict[str, str] = {
-            "bumper": self._ros.bumper_type,
-            "odometry": "Odometry",
-            "camera": self._ros.camera_type,
-            "battery": self._ros.battery_type,
-        }
-        self._stamps = {name: Stamps() for name in KEPT}
-        self._sequences = {name: Sequences() for name in KEPT}
-        self._pictures = Pictures()
-        self._endpoints: frozenset[Endpoint] = frozenset()
+        super().__init__(config.robot.ros2)
+        self._hardware = config.robot.hardware
         self._changes_seen = -1
-        self._pressed: bool | None = None
-        self._bumper_told = False
-        """Whether the network ever told of somebody who publishes the bumper."""
-        self._touch_until_s = -math.inf
-        self._robot_clock: tuple[int, float] | None = None
-        """Newest stamp of the odometry, and our clock when it arrived."""
         self._inbox = RawInbox()
         self._bus: ForeignBus | None = None
         self._publishers: dict[str, RawPublisher] = {}
@@ -155,9 +118,6 @@ class Ros2Link:
 
     # ------------------------------------------------------------ names and types
 
-    def _topic(self, topic: str) -> str:
-        return ros2_names.full_topic(self._ros.namespace, topic)
-
     def _hash(self, kind: str) -> str:
         if self._ros.distribution == "humble":
             return ros2_names.NO_HASH
@@ -183,15 +143,6 @@ class Ros2Link:
         )
         return cast(VelocityType, chosen), obstacle
 
-    def _wrong_sensor(self) -> str:
-        """A sensor that the robot publishes as another type; what it sends would mean nothing."""
-        for name, topic in self._topics.items():
-            told = ros2_names.types_on(self._endpoints, "publishes", topic)
-            if name != "velocity" and told and ros2_types.FULL_NAMES[self._kinds[name]] not in told:
-                types = " and ".join(sorted(ros2_names.short(full) for full in told))
-                return f"robot publishes {types} on {topic}, configured {self._kinds[name]}"
-        return ""
-
     # ------------------------------------------------------------ the link's thread
 
     def _connect(self) -> ForeignBus:
@@ -208,117 +159,48 @@ class Ros2Link:
                 time.sleep(RETRY_S)
 
     def _run(self) -> None:
-        takers: dict[str, Callable[[RawSample], None]] = {
-            "bumper": self._take_bumper,
-            "odometry": self._take_odometry,
-            "battery": self._take_battery,
-            "camera": self._take_camera,
-        }
         while not self._done.is_set():
             hold_s = self._touch_until_s - time.monotonic()
             self._inbox.wait(hold_s if 0.0 < hold_s < TICK_S else TICK_S)
-            while self._turn(takers) and not self._done.is_set():
+            while self._turn() and not self._done.is_set():
                 pass
-            for name, count in self._inbox.refused.copy().items():
-                if count:
-                    self.faults[f"{name}: too long or too many"] = count
+            self._count_refused()
+            self.explain()
 
-    def _turn(self, takers: dict[str, Callable[[RawSample], None]]) -> bool:
+    def _turn(self) -> bool:
         """Take the most urgent sample; False when there is none."""
         if self._changes_seen != self._inbox.changes:
             self._changes_seen = self._inbox.changes
             tokens = (ros2_names.parsed_token(t, self._ros.domain) for t in self._inbox.tokens())
             self._endpoints = frozenset(endpoint for endpoint in tokens if endpoint)
-        for name, take in takers.items():
+        for name in SENSORS:
             if name == "bumper" and time.monotonic() < self._touch_until_s:
                 continue
             sample = self._inbox.take(name)
             if sample is None:
                 continue
-            try:
-                take(sample)
-            except BadMessage as error:
-                self._fault(name, error)
-            except Exception as error:  # one odd message must not end all reading
-                log.exception("%s: could not be taken", name)
-                self.faults[f"{name}: {type(error).__name__}"] += 1
+            self.take(name, sample, time.monotonic())
             return True
         return False
 
-    def _take_bumper(self, sample: RawSample) -> None:
-        read = cdr.decode_bumper(sample.payload, self._ros.bumper_type)
-        if not self._new("bumper", sample, read.stamp_ns):
-            return
-        if read.value and not self._pressed:
-            self._touch_until_s = time.monotonic() + TOUCH_S
-        self._pressed = read.value
-        self.bumper.put(read.value, sample.arrived_s)
-
-    def _take_odometry(self, sample: RawSample) -> None:
-        read = cdr.decode_odometry(sample.payload)
-        if not self._new("odometry", sample, read.stamp_ns):
-            return
-        self._robot_clock = (read.stamp_ns, sample.arrived_s)
-        self.odometry.put(read.value, sample.arrived_s)
-        if self._ros.bumper_on_change:
-            self._confirm_bumper(sample.arrived_s)
-
-    def _confirm_bumper(self, arrived_s: float) -> None:
-        """The robot talks: its bumper, told on change alone, is still as it was last told."""
-        there = ros2_names.types_on(self._endpoints, "publishes", self._topics["bumper"])
-        self._bumper_told |= bool(there)
-        if self._pressed is None and there:
-            self._pressed = False
-        # Where the network tells who publishes, a publisher that went takes the all-clear with it.
-        if self._pressed is not None and (there or not (self._bumper_told or self._endpoints)):
-            self.bumper.put(self._pressed, arrived_s)
-
-    def _take_battery(self, sample: RawSample) -> None:
-        read = cdr.decode_battery(sample.payload, self._ros.battery_type)
-        if self._new("battery", sample, read.stamp_ns):
-            self.battery.put(read.value, sample.arrived_s)
-
-    def _take_camera(self, sample: RawSample) -> None:
-        read = cdr.decode_camera(sample.payload, self._ros.camera_type)
-        if not self._new("camera", sample, read.stamp_ns):
-            return
-        here = self.odometry.get()
-        if not self._pictures.new(read.value, here.value if here else None):
-            raise BadMessage("the same picture although the robot moved")
-        self.camera.put(preprocess(read.value), sample.arrived_s)
-
-    def _new(self, name: str, sample: RawSample, stamp_ns: int) -> bool:
-        """Whether a sample tells something new; one that repeats or comes late is counted."""
-        new = True
-        if self._ros.transport == "rmw-zenoh":
-            attachment = ros2_names.unpacked(sample.attachment)
-            if attachment is None:
-                raise BadMessage("without the attachment of rmw_zenoh")
-            new = self._sequences[name].new(attachment.gid, attachment.sequence)
-        new &= self._stamps[name].new(stamp_ns)
-        if not new:
-            self._fault(name, BadMessage("repeated or late"))
-        return new
-
-    def _fault(self, name: str, error: BadMessage) -> None:
-        """Count by reason; log when the count is 1, 2, 4, 8 ...: visible, never a flood."""
-        fault = f"{name}: {str(error).split(':')[0]}"
-        self.faults[fault] += 1
-        count = self.faults[fault]
-        if count & (count - 1) == 0:
-            log.warning("%s refused (%d so far): %s", name, count, error)
+    def _count_refused(self) -> None:
+        """What the inbox did not take was not read either."""
+        for name, count in self._inbox.refused.copy().items():
+            fault = f"{name}: too long or too many"
+            if name in KEPT and count > self.faults[fault]:
+                self._refuse(name, "too long or too many")
+                self.faults[fault] = count
 
     # ------------------------------------------------------------ the robot's clock
 
     def _stamp_ns(self, now_s: float) -> int:
-        """Now, on the robot's clock as its odometry shows it; 0 (which means now) without.
+        """Now, on the robot's clock; 0 (which means now) without.
 
         Bases refuse stamps that are old or go back, and nobody sets our clock by theirs.
         """
-        if self._robot_clock is None or self._robot_clock[0] <= 0:
+        stamp_ns = self._robot_clock.stamp_ns(now_s)
+        if stamp_ns <= 0:
             return 0
-        stamp_ns, arrived_s = self._robot_clock
-        stamp_ns += round((now_s - arrived_s) * _S_NS)
         if self._last_stamp_ns - _S_NS < stamp_ns <= self._last_stamp_ns:
             stamp_ns = self._last_stamp_ns + 1
         self._last_stamp_ns = stamp_ns

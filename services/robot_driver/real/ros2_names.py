@@ -52,8 +52,8 @@ class Attachment:
 
 
 def full_topic(namespace: str, topic: str) -> str:
-    """A topic with its namespace, without leading slash."""
-    return f"{namespace.strip('/')}/{topic}".lstrip("/")
+    """A topic with its namespace, without leading slashes."""
+    return f"{namespace.strip('/')}/{topic.lstrip('/')}".lstrip("/")
 
 
 def short(type_name: str) -> str:

@@ -89,7 +89,7 @@ def test_another_shape_than_its_own_is_refused(file: Path) -> None:
     ("robot", "sentence"),
     [
         ({"speed_m_s": 0.4}, r"way of an action of 0\.125 m, this robot has 0\.1 m"),
-        ({"turn_rad_s": 1.0}, r"turn of an action of 20 degrees, this robot has 14\.3 degrees"),
+        ({"turn_rad_s": 1.0}, r"turn of an action of 0\.349 radians, this robot has 0\.25 radians"),
         ({"camera": {"height_m": 0.2}}, r"height of the camera of 0\.3 m, this robot has 0\.2 m"),
         ({"camera": {"vertical_fov_deg": 60.0}}, "vertical view of the camera of 45 degrees"),
     ],

@@ -100,3 +100,9 @@ def test_a_retreat_with_a_free_bumper_stops_at_contact():
     recorder = Recorder([False] * 99)
     back_off(recorder, CONFIG, 1.0)  # type: ignore[arg-type]
     assert recorder.stopping == [True, False]  # the retreat, then the turn on the spot
+
+
+def test_a_robot_whose_bumper_never_lets_go_creeps_nowhere_after_its_retreat():
+    recorder = Recorder([True] * 99)
+    back_off(recorder, CONFIG, 1.0)  # type: ignore[arg-type]
+    assert all(velocity.forward_m_s <= 0.0 for velocity in recorder.velocities)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
+from fake_link import Plane
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,32 +16,10 @@ from services.robot_driver.emulation.dynamics import (
     BaseDynamics,
     EmulatedBase,
 )
-from services.robot_driver.robot import STANDSTILL, Pose, Velocity
+from services.robot_driver.robot import STANDSTILL, Velocity
 
 FAST = settings(deadline=None, max_examples=60, derandomize=True)
 AHEAD = Velocity(0.2, 0.0, 0.0)
-
-
-class Plane:
-    """A body without walls."""
-
-    def __init__(self) -> None:
-        self.pose = Pose(1.0, 2.0, math.pi / 2.0)
-        self.contact = False
-        self.velocity = STANDSTILL
-
-    def drive(self, velocity: Velocity) -> None:
-        self.velocity = velocity
-
-    def run(self, duration_s: float, *, stop_on_contact: bool) -> bool:
-        h, v = self.pose.heading_rad, self.velocity
-        forward, left = v.forward_m_s * duration_s, v.left_m_s * duration_s
-        self.pose = Pose(
-            self.pose.x_m + forward * math.cos(h) - left * math.sin(h),
-            self.pose.y_m + forward * math.sin(h) + left * math.cos(h),
-            h + v.turn_rad_s * duration_s,
-        )
-        return False
 
 
 def base_of(dynamics: BaseDynamics = ROBOTINO) -> EmulatedBase:

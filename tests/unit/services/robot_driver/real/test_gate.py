@@ -157,6 +157,23 @@ def test_a_problem_is_stronger_than_any_wish() -> None:
     assert gate.in_force(0.0) == STANDSTILL
 
 
+@pytest.mark.parametrize("lost", [0, 3])
+def test_a_robot_is_stopped_often_enough_before_it_drives_back(lost: int) -> None:
+    gate = gate_of()
+    gate.drive(AHEAD, 0.0)
+    sent(gate, 0.0, 0.05)
+    out: list[Velocity] = []
+    for tick in range(5, 60):
+        now_s = tick * TICK_S
+        gate.drive(SLOWLY, now_s)
+        gate.renew(now_s, regardless=True)
+        if (velocity := gate.due(now_s)) is not None:
+            gate.sent(velocity, now_s, arrived=len(out) >= lost)
+            out.append(velocity)
+    assert out[: ZEROS + lost + 1] == [STANDSTILL] * (ZEROS + lost) + [SLOWLY]
+    assert set(out[ZEROS + lost :]) == {SLOWLY}
+
+
 def test_stops_that_did_not_arrive_are_sent_until_enough_did() -> None:
     gate, tries, arrived = gate_of(), 0, 0
     for tick in range(300):

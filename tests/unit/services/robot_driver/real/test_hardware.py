@@ -15,9 +15,11 @@ from benchmarks.waiting import wait_until
 from services.robot_driver.driver import Driver
 from services.robot_driver.kinds import make_robot
 from services.robot_driver.motion_control import action_velocity
+from services.robot_driver.real import hardware
 from services.robot_driver.real.gate import ZEROS
 from services.robot_driver.real.hardware import HardwareRobot
-from services.robot_driver.robot import STANDSTILL, NotReady, Pose, RobotFault, Velocity
+from services.robot_driver.real.link import Battery
+from services.robot_driver.robot import STANDSTILL, NotReady, Pose, Velocity
 from shared.config import Config, RobotConfig
 from shared.errors import ConfigError, RobotMissing
 from shared.keys import ROBOT_STATE
@@ -44,6 +46,14 @@ def moves(link: FakeLink, velocity: Velocity = AHEAD) -> None:
 
 def stops(link: FakeLink) -> None:
     wait_until(lambda: link.told[-ZEROS:] == [STANDSTILL] * ZEROS, 20, "stops are sent")
+
+
+def fit(robot: HardwareRobot) -> bool:
+    try:
+        robot.sense()
+    except NotReady:
+        return False
+    return True
 
 
 def test_it_senses_what_the_link_told(robot: HardwareRobot) -> None:
@@ -89,23 +99,16 @@ def test_it_stands_while_it_is_not_fit_and_can_go_on_after(
     mend(link)
     stops(link)
 
-    def fit() -> bool:
-        try:
-            robot.sense()
-        except NotReady:
-            return False
-        return True
-
-    wait_until(fit, 20, "it is fit again")
+    wait_until(lambda: fit(robot), 20, "it is fit again")
     robot.drive(AHEAD)
     moves(link)
 
 
 @pytest.mark.parametrize("sensor", ["camera", "odometry", "bumper"])
 def test_a_reading_of_every_sensor_grows_old(sensor: str, link: FakeLink) -> None:
-    hardware = config_of().robot.hardware
+    limits = config_of().robot.hardware
     patient = {f"{name}_stale_s": 5.0 for name in ("camera", "odometry", "bumper")}
-    ages = hardware.model_copy(update={**patient, f"{sensor}_stale_s": 0.5})
+    ages = limits.model_copy(update={**patient, f"{sensor}_stale_s": 0.5})
     config, ahead_s = config_of().robot.model_copy(update={"hardware": ages}), 0.0
     robot = HardwareRobot(config, link, lambda: time.monotonic() + ahead_s)
     ahead_s = 0.6
@@ -172,19 +175,64 @@ def test_closing_does_not_wait_for_ever_where_nothing_gets_through(
     assert link.closed == 1
 
 
-def test_a_robot_that_does_not_answer_is_no_robot(link: FakeLink) -> None:
-    link.held = {"bumper"}
-    link.faults["bumper: timeout"] = 3
-    hardware = config_of().robot.hardware.model_copy(update={"open_timeout_s": 0.3})
-    config = config_of().robot.model_copy(update={"hardware": hardware})
-    with pytest.raises(RobotFault, match=r"no bumper within .*bumper: timeout \(3\)"):
-        HardwareRobot(config, link)
-    assert link.closed == 1
+def test_a_robot_without_a_bumper_stands_and_says_why(
+    link: FakeLink, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hardware, "READING_S", 0.1)
+    link.held, link.bumper.note = {"bumper"}, "nobody publishes on bumper"
+    robot = HardwareRobot(config_of().robot, link)
+    with pytest.raises(NotReady, match=r"^bumper: no reading: nobody publishes on bumper$"):
+        robot.sense()
+    link.held.clear()
+    wait_until(lambda: fit(robot), 20, "it is fit")
+    link.held.add("bumper")
+    link.bumper.void("lifted")
+    with pytest.raises(NotReady, match=r"^bumper: no reading: lifted$"):
+        robot.drive(AHEAD)
+    robot.close()
+
+
+def test_a_battery_is_low_good_or_unknown(robot: HardwareRobot, link: FakeLink) -> None:
+    link._done.set()
+    link._thread.join()
+    now_s = robot.now_s()
+    for low, age_s, known in (
+        (None, 0.0, None),
+        (False, 0.0, False),
+        (False, 100.0, None),
+        (True, 100.0, True),
+        (None, 0.0, True),
+        (False, 0.0, False),
+    ):
+        link.battery.put(Battery(low, None), now_s - age_s)
+        assert robot.battery_low() is known
+        assert robot.faults["battery: unknown"] == (known is None)
+    link.battery.void("truncated")
+    assert robot.battery_low() is None
+
+
+@pytest.mark.parametrize("ordered", [True, False], ids=["stalled", "pushed"])
+def test_a_robot_that_moves_otherwise_than_it_is_told_stands(
+    ordered: bool, robot: HardwareRobot, link: FakeLink
+) -> None:
+    link.stalled = True
+    if ordered:
+        robot.drive(AHEAD)
+
+    def goes_on() -> None:
+        for step in range(1000):
+            if not ordered:
+                link.pose = Pose(1.0 + 0.01 * step, 2.0, 0.5)
+            robot.run(0.02, stop_on_contact=True)
+
+    with pytest.raises(NotReady, match="told to drive" if ordered else "nobody told it to"):
+        goes_on()
+    stops(link)
 
 
 def test_an_address_where_nobody_is_ends_in_one_line() -> None:
     config = config_of(robotino={"address": "127.0.0.1:9"}, hardware={"open_timeout_s": 3.0})
-    with pytest.raises(RobotMissing, match=r"^driver: robot: no odometry .*: no connection"):
+    with pytest.raises(RobotMissing, match=r"^driver: robot: no answer from .*: no connection"):
         make_robot(config)
 
 

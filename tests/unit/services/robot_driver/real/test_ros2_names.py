@@ -8,6 +8,9 @@ from hypothesis import strategies as st
 
 from services.robot_driver.real import ros2_names
 from services.robot_driver.real.ros2_names import Attachment, Endpoint
+from shared.config import Ros2Config
+from shared.errors import ConfigError
+from shared.settings import load as settings_of
 
 FAST = settings(deadline=None, max_examples=60, derandomize=True)
 
@@ -22,6 +25,26 @@ def test_topics_have_their_namespace_and_no_leading_slash() -> None:
     assert ros2_names.full_topic("", "cmd_vel") == "cmd_vel"
     assert ros2_names.full_topic("bot1", "oakd/rgb") == "bot1/oakd/rgb"
     assert ros2_names.full_topic("a/b/", "odom") == "a/b/odom"
+    assert ros2_names.full_topic("", "/cmd_vel") == "cmd_vel"
+    assert ros2_names.full_topic("/bot1", "/odom") == "bot1/odom"
+
+
+@pytest.mark.parametrize("name", ["/cmd_vel", "cmd_vel", "/bot1/odom", "_a/b_2"])
+def test_ros_names_are_taken_with_and_without_a_leading_slash(name: str) -> None:
+    config = Ros2Config(odometry_topic=name, namespace=name, battery_topic=name)
+    assert config.odometry_topic == name
+    assert Ros2Config(namespace="", battery_topic="").battery_topic == ""
+
+
+@pytest.mark.parametrize(
+    "name", ["*", "a/**", "a$*", "a?", "a#b", "a//b", "//a", "a/", "/", "1a", "a b", "~/a"]
+)
+def test_names_that_would_be_patterns_or_none_are_refused_with_an_example(name: str) -> None:
+    for field in ("odometry_topic", "namespace", "battery_topic"):
+        with pytest.raises(ConfigError) as caught:
+            settings_of(None, overrides=[f"robot.ros2.{field}={name}"])
+        told = f"robot.ros2.{field}: expected a ROS name such as 'cmd_vel' or '/bot1/odom', got"
+        assert str(caught.value).startswith(told)
 
 
 def test_keys_of_rmw_zenoh_name_domain_topic_type_and_hash() -> None:

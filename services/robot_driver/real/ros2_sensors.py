@@ -1,0 +1,205 @@
+"""What the sensors of a ROS 2 robot send, judged and put into slots (no clock, no network)."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections import Counter
+from typing import Any
+
+from services.robot_driver.real import cdr, ros2_names, ros2_types
+from services.robot_driver.real.freshness import Pictures, RobotClock, Sequences, Stamps
+from services.robot_driver.real.link import Battery, Newest
+from services.robot_driver.real.ros2_names import Endpoint
+from services.robot_driver.robot import Pose
+from shared.config import Ros2Config
+from shared.errors import BadMessage
+from shared.foreign_bus import RawSample
+from shared.messages import ImageArray
+from shared.rl.preprocess import preprocess
+
+log = logging.getLogger(__name__)
+SENSORS = ("bumper", "odometry", "battery", "camera")
+"""The most urgent first."""
+TOUCH_S = 0.03
+"""A touch is shown at least this long, so that whoever watches the slot sees it."""
+BEHIND_S = 1.0
+BEHIND = "made long before other messages: late, or of another clock (robot.ros2.camera_clock)"
+"""Why a sensor is old whose messages were made so long before they came."""
+AT_A_PERIOD = "set hazards_pub_fixed_period_ms to 50 on the base"
+PRESS = f"press it once, or {AT_A_PERIOD} and robot.ros2.bumper_on_change to false"
+
+
+class Ros2Sensors:
+    """The sensors of a ROS 2 robot: slots of `link.Link`, and what is known of their messages.
+
+    A bumper that is published on change alone is silent for hours. Once it was heard, every new
+    odometry shows that the robot still talks and had nothing new to tell, while the network tells
+    that somebody publishes it. Before that it is unknown, and the robot does not drive.
+    """
+
+    def __init__(self, ros: Ros2Config) -> None:
+        self._ros = ros
+        self.camera: Newest[ImageArray] = Newest()
+        self.odometry: Newest[Pose] = Newest()
+        self.bumper: Newest[bool] = Newest()
+        self.battery: Newest[Battery] = Newest()
+        self.faults: Counter[str] = Counter()
+        parts = ("velocity", *SENSORS)
+        topics = {part: getattr(ros, f"{part}_topic") for part in parts}
+        self._topics = {
+            part: ros2_names.full_topic(ros.namespace, topic)
+            for part, topic in topics.items()
+            if topic
+        }
+        self._kinds: dict[str, str] = {
+            "bumper": ros.bumper_type,
+            "odometry": "Odometry",
+            "camera": ros.camera_type,
+            "battery": ros.battery_type,
+        }
+        self._robot_clock = RobotClock()
+        own = RobotClock() if ros.camera_clock == "own" else self._robot_clock
+        self._clocks = {**dict.fromkeys(SENSORS, self._robot_clock), "camera": own}
+        self._stamps = {name: Stamps(self._clocks[name]) for name in SENSORS}
+        self._sequences = {name: Sequences() for name in SENSORS}
+        self._pictures = Pictures()
+        self._endpoints: frozenset[Endpoint] = frozenset()
+        self._pressed: bool | None = None
+        self._bumper_told = False
+        """Whether the network ever told of somebody who publishes the bumper."""
+        self._touch_until_s = -math.inf
+        self._percent = False
+        """Whether the battery told its charge in percent."""
+        self._hints: dict[str, str] = {}
+
+    def take(self, name: str, sample: RawSample, now_s: float) -> None:
+        """Take one message; what cannot be read, repeats or comes late is counted."""
+        pressed = self._pressed
+        try:
+            getattr(self, f"_take_{name}")(sample)
+        except BadMessage as error:
+            self._refuse(name, str(error))
+        except Exception as error:  # one odd message must not end all reading
+            log.exception("%s: could not be taken", name)
+            self._refuse(name, type(error).__name__)
+        if self._pressed and not pressed:
+            self._touch_until_s = now_s + TOUCH_S
+
+    def _wrong_sensor(self) -> str:
+        """A sensor that the robot publishes as another type; what it sends would mean nothing."""
+        for name, topic in self._topics.items():
+            told = ros2_names.types_on(self._endpoints, "publishes", topic)
+            if name != "velocity" and told and ros2_types.FULL_NAMES[self._kinds[name]] not in told:
+                types = " and ".join(sorted(ros2_names.short(full) for full in told))
+                return f"robot publishes {types} on {topic}, configured {self._kinds[name]}"
+        return ""
+
+    def _take_bumper(self, sample: RawSample) -> None:
+        read = cdr.decode_bumper(sample.payload, self._ros.bumper_type)
+        made_s = self._made_s("bumper", sample, read.stamp_ns)
+        if made_s is None:
+            return
+        self._pressed = read.value
+        self._put("bumper", read.value, sample, made_s)
+
+    def _take_odometry(self, sample: RawSample) -> None:
+        read = cdr.decode_odometry(sample.payload)
+        made_s = self._made_s("odometry", sample, read.stamp_ns)
+        if made_s is None:
+            return
+        self._put("odometry", read.value, sample, made_s)
+        if self._ros.bumper_on_change:
+            self._confirm_bumper(made_s)
+
+    def _confirm_bumper(self, made_s: float) -> None:
+        """The robot talks: its bumper, told on change alone, is still as it was last told."""
+        there = ros2_names.types_on(self._endpoints, "publishes", self._topics["bumper"])
+        self._bumper_told |= bool(there)
+        # Where the network tells who publishes, a publisher that went takes the all-clear with it.
+        if self._pressed is not None and (there or not (self._bumper_told or self._endpoints)):
+            self.bumper.put(self._pressed, made_s)
+
+    def _take_battery(self, sample: RawSample) -> None:
+        kind = self._ros.battery_type
+        read = cdr.decode_battery(sample.payload, kind, percent=self._percent)
+        made_s = self._made_s("battery", sample, read.stamp_ns)
+        if made_s is not None:
+            self._percent |= (read.value.charge or 0.0) > cdr.FULL
+            self._put("battery", read.value, sample, made_s)
+
+    def _take_camera(self, sample: RawSample) -> None:
+        read = cdr.decode_camera(sample.payload, self._ros.camera_type)
+        made_s = self._made_s("camera", sample, read.stamp_ns)
+        if made_s is None:
+            return
+        here = self.odometry.get()
+        if not self._pictures.new(read.value, here.value if here else None, made_s):
+            raise BadMessage("the same picture although the robot moved")
+        self._put("camera", preprocess(read.value), sample, made_s, f"{read.facts}, ")
+
+    def _made_s(self, name: str, sample: RawSample, stamp_ns: int) -> float | None:
+        """When a sample was made, on our clock; None for one that repeats or comes late.
+
+        Whether a bumper was touched since is unknown when its messages come late.
+        """
+        stamps = self._stamps[name]
+        if self._ros.transport == "rmw-zenoh":
+            attachment = ros2_names.unpacked(sample.attachment)
+            if attachment is None:
+                raise BadMessage("without the attachment of rmw_zenoh")
+            if not self._sequences[name].new(attachment.gid, attachment.sequence):
+                self._fault(name, "repeated or late")
+                return None
+        made_s = stamps.made_s(stamp_ns, sample.arrived_s)
+        if made_s is None and name == "bumper" and not stamps.copied:
+            raise BadMessage("repeated or late")
+        if made_s is None:
+            self._fault(name, "repeated or late")
+        return made_s
+
+    def _put(
+        self, name: str, value: Any, sample: RawSample, made_s: float, facts: str = ""
+    ) -> None:
+        """Put a reading, with how long it took and how far the robot's clock is from ours."""
+        apart_s, behind_s = self._clocks[name].apart_s, sample.arrived_s - made_s
+        clock = "no stamps" if apart_s is None else f"robot's clock {-apart_s:+.3f} s from ours"
+        slot: Newest[Any] = getattr(self, name)
+        slot.put(value, made_s, f"{facts}{behind_s:.3f} s on its way, {clock}")
+        slot.note = BEHIND if behind_s > BEHIND_S else ""
+
+    def explain(self) -> None:
+        """Let sensors without a reading say what the network tells of them, or what to do."""
+        for name in self._kinds.keys() & self._topics.keys():
+            slot: Newest[Any] = getattr(self, name)
+            if slot.get() is None and slot.note in ("", self._hints.get(name)):
+                self._hints[name] = slot.note = self._hint(name)
+
+    def _hint(self, name: str) -> str:
+        topic = self._topics[name]
+        if self._endpoints and not ros2_names.types_on(self._endpoints, "publishes", topic):
+            return f"nobody publishes on {topic}"
+        if name == "bumper" and self._ros.bumper_on_change:
+            return PRESS
+        return AT_A_PERIOD if self._kinds[name] == "HazardDetectionVector" else "nothing heard"
+
+    def _refuse(self, name: str, why: str) -> None:
+        """Count what was no reading, and let its slot say why.
+
+        A message of the bumper or of the battery that cannot be read ends what was read before.
+        """
+        slot: Newest[Any] = getattr(self, name)
+        if name in ("bumper", "battery"):
+            slot.void(why)
+        if name == "bumper":
+            self._pressed = None
+        slot.note = why
+        self._fault(name, why)
+
+    def _fault(self, name: str, why: str) -> None:
+        """Count by reason; log when the count is 1, 2, 4, 8 ...: visible, never a flood."""
+        fault = f"{name}: {why.split(':')[0]}"
+        self.faults[fault] += 1
+        count = self.faults[fault]
+        if count & (count - 1) == 0:
+            log.warning("%s refused (%d so far): %s", name, count, why)

@@ -1,0 +1,1 @@
+"""What is done with a real robot before it learns: looked at, and measured."""
