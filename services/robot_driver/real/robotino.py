@@ -58,7 +58,7 @@ class RobotinoLink:
             )
         command_s = min(robotino.timeout_s, config.robot.hardware.command_period_s)
         self._commands = Connection(robotino.address, command_s)
-        self._sequence: int | None = None
+        self._sequence: float | None = None
         self._pictures = Pictures()
 
     def open(self) -> None:

@@ -41,6 +41,7 @@ class Ros2Link(Ros2Sensors):
     def __init__(self, config: Config) -> None:
         super().__init__(config.robot.ros2)
         self._hardware = config.robot.hardware
+        self._epoch_s = time.time() - time.monotonic()
         self._changes_seen = -1
         self._inbox = RawInbox()
         self._bus: ForeignBus | None = None

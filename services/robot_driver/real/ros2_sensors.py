@@ -72,6 +72,8 @@ class Ros2Sensors:
         self._percent = False
         """Whether the battery told its charge in percent."""
         self._hints: dict[str, str] = {}
+        self._epoch_s = 0.0
+        """The time of day less our monotonic clock."""
 
     def take(self, name: str, sample: RawSample, now_s: float) -> None:
         """Take one message; what cannot be read, repeats or comes late is counted."""
@@ -163,9 +165,9 @@ class Ros2Sensors:
     ) -> None:
         """Put a reading, with how long it took and how far the robot's clock is from ours."""
         apart_s, behind_s = self._clocks[name].apart_s, sample.arrived_s - made_s
-        clock = "no stamps" if apart_s is None else f"robot's clock {-apart_s:+.3f} s from ours"
+        skew = "no stamps" if apart_s is None else f"clock {-apart_s - self._epoch_s:+.3f} s"
         slot: Newest[Any] = getattr(self, name)
-        slot.put(value, made_s, f"{facts}{behind_s:.3f} s on its way, {clock}")
+        slot.put(value, made_s, f"{facts}{behind_s:.3f} s on its way, {skew}")
         slot.note = BEHIND if behind_s > BEHIND_S else ""
 
     def explain(self) -> None:
