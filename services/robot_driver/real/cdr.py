@@ -96,7 +96,7 @@ def decode_camera(data: bytes, kind: CameraType) -> Stamped[RgbImage]:
         size_px, form = (int(message.width), int(message.height)), message.encoding
         step, big_endian = int(message.step), bool(message.is_bigendian)
         pixels = raw(form, size_px, step, big_endian, message.data)
-    facts = f"{pixels.shape[1]}x{pixels.shape[0]} {form:.40}"
+    facts = f"{pixels.shape[1]}x{pixels.shape[0]} {form:.40}, "
     return Stamped(pixels, stamp_ns_of(message), facts)
 
 

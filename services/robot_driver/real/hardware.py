@@ -199,6 +199,7 @@ class HardwareRobot(Robot):
     def _problem(self, now_s: float) -> str:
         """Why the robot must not move now; empty when it may."""
         self._look(now_s)
+        low = self.battery_low()  # whatever else is wrong: a low one is remembered
         link, ages = self._link, self._config.hardware
         for name, reading, oldest_s in (
             ("camera", link.camera.get(), ages.camera_stale_s),
@@ -211,7 +212,7 @@ class HardwareRobot(Robot):
                 return f"{name}: no reading{why}"
             if now_s - reading.stamp_s > oldest_s:
                 return f"{name}: nothing new for more than {oldest_s:g} s{why}"
-        if self.battery_low():
+        if low:
             return "battery: low"
         if obstacle := link.obstacle():
             return obstacle

@@ -35,6 +35,11 @@ class Connection(http.client.HTTPConnection):
         super().__init__(address, timeout=limit_s)
         self._limit_s = limit_s
 
+    def connect(self) -> None:
+        """Connect, with a socket that knows its moment."""
+        super().connect()
+        self.sock = _Socket(fileno=self.sock.detach())
+
     def call(
         self, method: str, path: str, content: bytes | None, limit: int, *, whole: bool
     ) -> tuple[int, bytes]:
@@ -52,7 +57,6 @@ class Connection(http.client.HTTPConnection):
         try:
             if self.sock is None:
                 self.connect()
-                self.sock = _Socket(fileno=self.sock.detach())
             self.sock.until_s = until_s
             self.sock.settimeout(self._limit_s)
             self.request(method, path, content, {"Content-Type": "application/json"})
