@@ -34,9 +34,9 @@ WIDTH, HEIGHT = 800, 600
 QUALITY = 80
 VERTICAL_FOV_DEG = 43.0
 COLD_S = 10.0
+"""Without a request for this long the camera is let go: the next one finds none."""
 SILENT_S = 10.0
 """Longest that a request is left without an answer; then its connection is closed."""
-"""Without a request for this long the camera is let go: the next one finds none."""
 MAX_BODY = 4096
 Speed = Annotated[float, Field(strict=True, ge=-2.0, le=2.0, allow_inf_nan=False)]
 Turn = Annotated[float, Field(strict=True, ge=-3.0, le=3.0, allow_inf_nan=False)]

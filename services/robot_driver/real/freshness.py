@@ -19,7 +19,6 @@ AHEAD_S, RECENT_S = 0.5, 10.0
 of the time before."""
 SEEN_S = 2.0
 """Stamps of the last seconds are remembered: a copy never shows that a clock was set back."""
-MAX_SEEN = 512
 MAX_SENDERS = 16
 """Publishers of one topic that are told apart; of more, the longest silent one is forgotten."""
 MOVED_M, MOVED_RAD = 0.01, 0.02
@@ -83,7 +82,7 @@ class Stamps:
         self._newest = 0
         self._row: list[tuple[int, float]] = []
         """Messages since the newest that may be of a clock that was set."""
-        self._seen: deque[tuple[int, float]] = deque(maxlen=MAX_SEEN)
+        self._seen: deque[tuple[int, float]] = deque(maxlen=512)
         self.copied = False
         """Whether the message judged last was a copy of one before."""
 

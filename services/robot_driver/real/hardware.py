@@ -237,9 +237,8 @@ class HardwareRobot(Robot):
     def _open(self) -> None:
         self._link.open()
         limit_s = self._clock() + READING_S
-        slots: tuple[Newest[Any], ...]
-        slots = (self._link.odometry, self._link.bumper, self._link.camera)
-        for slot in slots:
+        for name in ("odometry", "bumper", "camera"):
+            slot: Newest[Any] = getattr(self._link, name)
             slot.wait(0, max(limit_s - self._clock(), 0.0))
 
     def _watch(self) -> None:

@@ -7,6 +7,7 @@ import math
 import select
 import socket
 import time
+from contextlib import nullcontext, suppress
 from typing import Any
 
 
@@ -61,22 +62,14 @@ class Connection(http.client.HTTPConnection):
             self.sock.settimeout(self._limit_s)
             self.request(method, path, content, {"Content-Type": "application/json"})
             reply = self.getresponse()
-            status, body = reply.status, self._body(reply, limit, whole=whole)
+            body = b""
+            with nullcontext() if whole else suppress(OSError, http.client.HTTPException):
+                body = reply.read(limit + 1)
+            if not reply.isclosed():  # too long, cut off, or still on its way
+                self.close()
+            if whole and reply.length and len(body) <= limit:
+                raise http.client.IncompleteRead(body)
         except BaseException:
             self.close()
             raise
-        if len(body) > limit:
-            self.close()
-        return status, body
-
-    def _body(self, reply: http.client.HTTPResponse, limit: int, *, whole: bool) -> bytes:
-        try:
-            body = reply.read(limit + 1)
-            if reply.length and len(body) <= limit:
-                raise http.client.IncompleteRead(body)
-        except (OSError, http.client.HTTPException):
-            if whole:
-                raise
-            self.close()
-            return b""
-        return body
+        return reply.status, body

@@ -66,7 +66,6 @@ class Ros2Sensors(Slots):
         self._sequences = {name: Sequences() for name in SENSORS}
         self._pictures = Pictures()
         self._endpoints: frozenset[Endpoint] = frozenset()
-        self._pressed: bool | None = None
         self._bumper_told = False
         """Whether the network ever told of somebody who publishes the bumper."""
         self._touch_until_s = -math.inf
@@ -78,7 +77,7 @@ class Ros2Sensors(Slots):
 
     def take(self, name: str, sample: RawSample, now_s: float) -> None:
         """Take one message; what cannot be read, repeats or comes late is counted."""
-        pressed = self._pressed
+        before = self.bumper.get()
         try:
             read = self._decoders[name](sample.payload)
             made_s = self._made_s(name, sample, read.stamp_ns)
@@ -89,7 +88,8 @@ class Ros2Sensors(Slots):
         except Exception as error:  # one odd message must not end all reading
             log.exception("%s: could not be taken", name)
             self.refuse(name, type(error).__name__)
-        if self._pressed and not pressed:
+        after = self.bumper.get()
+        if after is not None and after.value and not (before is not None and before.value):
             self._touch_until_s = now_s + TOUCH_S
 
     def _wrong_sensor(self) -> str:
@@ -109,8 +109,6 @@ class Ros2Sensors(Slots):
             if not self._pictures.new(value, here.value if here else None, made_s):
                 raise BadMessage("the same picture although the robot moved")
             value = preprocess(value)
-        elif name == "bumper":
-            self._pressed = value
         elif name == "battery":
             self._percent |= (value.charge or 0.0) > cdr.FULL
         apart_s, behind_s = self._clocks[name].apart_s, sample.arrived_s - made_s
@@ -126,8 +124,9 @@ class Ros2Sensors(Slots):
         there = ros2_names.types_on(self._endpoints, "publishes", self._topics["bumper"])
         self._bumper_told |= bool(there)
         # Where the network tells who publishes, a publisher that went takes the all-clear with it.
-        if self._pressed is not None and (there or not (self._bumper_told or self._endpoints)):
-            self.bumper.put(self._pressed, made_s)
+        last = self.bumper.get()
+        if last is not None and (there or not (self._bumper_told or self._endpoints)):
+            self.bumper.put(last.value, made_s)
 
     def _made_s(self, name: str, sample: RawSample, stamp_ns: int) -> float | None:
         """When a sample was made, on our clock; None for one that repeats or comes late.
@@ -163,9 +162,3 @@ class Ros2Sensors(Slots):
         if name == "bumper" and self._ros.bumper_on_change:
             return PRESS
         return AT_A_PERIOD if self._kinds[name] == "HazardDetectionVector" else "nothing heard"
-
-    def refuse(self, name: str, why: str, *, heard: bool = True) -> None:
-        """As every link does; odometry confirms no bumper that could not be read."""
-        super().refuse(name, why, heard=heard)
-        if name == "bumper":
-            self._pressed = None
