@@ -107,7 +107,10 @@ class HardwareRobot(Robot):
     def feel(self) -> Felt:
         """The newest odometry and bumper. Raises NotReady when the robot is not fit to drive."""
         self._check()
-        return Felt(self._pose, _there("bumper", self._link.bumper.get()))
+        contact = _there("bumper", self._link.bumper.get())
+        if not contact:
+            self._touched(False)  # its own thread may come later than the driver
+        return Felt(self._pose, contact)
 
     def drive(self, velocity: Velocity) -> None:
         """Set the velocity, leased until `run` renews it.
