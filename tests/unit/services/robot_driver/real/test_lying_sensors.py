@@ -26,7 +26,7 @@ from services.robot_driver.real.ros2_sensors import Ros2Sensors
 from services.robot_driver.robot import STANDSTILL, NotReady, Pose, Velocity
 from shared.foreign_bus import RawSample
 
-SEQUENCES = 20
+SEQUENCES = 12
 """Of each kind of robot."""
 TICK_S, SOUND_S, LONG_S, WAY_S = 0.02, 1.0, 6.0, 0.01
 PERIODS_S = {"odometry": 0.06, "bumper": 0.06, "camera": 0.1, "battery": 0.5}
