@@ -40,8 +40,6 @@ def decoded(data: bytes) -> RgbImage:
         BadMessage: It is neither, is larger than `MAX_SIDE_PX` either way, or is damaged, where
             other decoders would fill in what is missing.
     """
-    if not data:
-        raise BadMessage("empty")
     if not data.startswith((_JPEG, _PNG)):
         raise BadMessage("neither JPEG nor PNG")
     try:

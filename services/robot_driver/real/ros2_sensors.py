@@ -40,8 +40,7 @@ class Ros2Sensors(Slots):
     def __init__(self, ros: Ros2Config) -> None:
         super().__init__()
         self._ros = ros
-        parts = ("velocity", *SENSORS)
-        topics = {part: getattr(ros, f"{part}_topic") for part in parts}
+        topics = {part: getattr(ros, f"{part}_topic") for part in ("velocity", *SENSORS)}
         self._topics = {
             part: ros2_names.full_topic(ros.namespace, topic)
             for part, topic in topics.items()
