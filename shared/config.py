@@ -130,7 +130,7 @@ class RobotinoConfig(Section):
     """Period of bumper and odometry."""
     battery_period_s: float = Field(default=5.0, gt=0.0, le=60.0)
     timeout_s: float = Field(default=0.25, gt=0.0, le=5.0)
-    """Timeout of one request or command."""
+    """Longest time of a whole request or command, its answer included."""
 
 
 def _topic(name: str) -> str:

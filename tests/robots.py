@@ -139,13 +139,13 @@ def fit(robot: Robot) -> bool:
 def press(emulated: EmulatedRos2, robot: Robot) -> None:
     """Press and release the bumper until it was felt, as its operator does at the start."""
 
-    def felt() -> bool:
-        emulated.change({"bumper": "stuck" if emulated.faults.bumper == "" else ""})
+    def told(pressed: bool) -> bool:
+        emulated.change({"bumper": "stuck" if pressed else ""})
         with suppress(AssertionError):  # one message may be lost, and there is no other
-            wait_until(lambda: fit(robot), 2, "it was felt")
-        return fit(robot) and not robot.feel().contact
+            wait_until(lambda: fit(robot) and robot.feel().contact == pressed, 3, "it was felt")
+        return fit(robot) and robot.feel().contact == pressed
 
-    wait_until(felt, 60, "the bumper is felt")
+    wait_until(lambda: told(True) and told(False), 60, "the bumper is felt")
 
 
 SUBJECTS: dict[str, Callable[[], AbstractContextManager[Subject]]] = {

@@ -172,8 +172,14 @@ def _try(folder: Path, version: str, python: str, wheel: Path, extra: str) -> bo
 
 
 def _wheel(folder: Path) -> Path:
+    """The wheel, built from a copy: a build leaves files behind that the next one takes along."""
+    source = folder / "source"
+    for name in ("shared", "services", "experiments"):
+        shutil.copytree(ROOT / name, source / name)
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "-qqq"]
-    subprocess.run([*pip, "wheel", "--no-deps", "-w", folder, ROOT], check=True)
+    subprocess.run([*pip, "wheel", "--no-deps", "-w", folder, source], check=True)
     return next(folder.glob("corridor-*.whl"))
 
 

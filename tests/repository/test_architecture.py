@@ -48,6 +48,7 @@ def test_zenoh_is_imported_by_our_buses_and_by_the_first_stop_alone() -> None:
     }
     assert importers("shared.foreign_bus") == {
         "services/robot_driver/real/ros2.py",
+        "services/robot_driver/real/ros2_sensors.py",
         "services/robot_driver/emulation/ros2.py",
         "services/robot_driver/emulation/ros2_faults.py",
         "services/robot_driver/emulation/ros2_network.py",
@@ -62,8 +63,8 @@ def test_one_file_imports_pybullet() -> None:
     assert users("pybullet") == {"services/robot_driver/simulated/scene.py"}
 
 
-def test_one_file_imports_httpx() -> None:
-    assert users("httpx") == {"services/robot_driver/real/robotino.py"}
+def test_one_file_imports_simplejpeg() -> None:
+    assert users("simplejpeg") == {"services/robot_driver/real/picture.py"}
 
 
 def test_one_file_imports_cryptography() -> None:

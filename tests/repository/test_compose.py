@@ -44,7 +44,7 @@ FOREIGN = {
     "pybullet": "pybullet",
     "opencv-python-headless": "cv2",
     "pillow": "PIL",
-    "httpx": "httpx",
+    "simplejpeg": "simplejpeg",
     "rosbags": "rosbags",
     "openvino": "openvino",
     "torch": "torch",

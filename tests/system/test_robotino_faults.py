@@ -69,7 +69,7 @@ def well(state: RobotState) -> bool:
         ({"camera": "truncated"}, {"camera": ""}, "camera"),
         ({"camera": "flat"}, {"camera": ""}, "camera"),
         ({"odometry": "frozen"}, {"odometry": ""}, "odometry"),
-        ({"odometry": "stalled"}, {"odometry": ""}, "odometry: stands"),
+        ({"odometry": "constant"}, {"odometry": ""}, "odometry: stands"),
         ({"bumper": "unreadable"}, {"bumper": ""}, "bumper"),
         ({"bumper": "nonsense"}, {"bumper": ""}, "bumper"),
         ({"network": "cut"}, {"network": ""}, ""),

@@ -73,7 +73,7 @@ def well(state: RobotState) -> bool:
         ({"wrong_type": True}, {"wrong_type": False}, "listens for TwistStamped on cmd_vel"),
         ({"nobody_listens": True}, {"nobody_listens": False}, "nothing on the robot listens"),
         ({"odometry": "frozen"}, {"odometry": ""}, "odometry"),
-        ({"odometry": "stalled"}, {"odometry": ""}, "odometry: stands"),
+        ({"odometry": "constant"}, {"odometry": ""}, "odometry: stands"),
         ({"camera": "frozen"}, {"camera": ""}, "camera"),
         ({"camera": "restamped"}, {"camera": ""}, "camera"),
         ({"camera_late_s": 30.0}, {"camera_late_s": 0.0}, "camera: nothing new"),

@@ -368,6 +368,7 @@ def test_it_finds_a_robot_again_that_was_gone(ros2: dict[str, object]) -> None:
             wait_until(lambda: link.obstacle(), PATIENCE_S, "it is gone")
             gone_s = time.monotonic()
             wait_obstacle(link, "")
+            emulated.change({"bumper": "stuck"})  # told on change, it says nothing before
             for slot in (link.odometry, link.camera, link.bumper):
                 wait_until(
                     lambda slot=slot: (r := slot.get()) and r.stamp_s > gone_s,  # type: ignore[misc]

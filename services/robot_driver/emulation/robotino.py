@@ -13,32 +13,34 @@ import socket
 import struct
 import threading
 import time
-from dataclasses import asdict
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
+from pydantic import Field, TypeAdapter, ValidationError
 
 from services.robot_driver.emulation.dynamics import ROBOTINO, STEP_S
 from services.robot_driver.emulation.robotino_faults import Faults
-from services.robot_driver.emulation.world import EmulatedRobot, Truth, camera_of
+from services.robot_driver.emulation.world import EmulatedRobot, camera_of
 from services.robot_driver.robot import Velocity
 from shared.config import RobotConfig
-from shared.errors import ConfigError
+from shared.errors import ConfigError, first_problem
 
 WIDTH, HEIGHT = 800, 600
 QUALITY = 80
 VERTICAL_FOV_DEG = 43.0
 COLD_S = 10.0
+"""Without a request for this long the camera is let go: the next one finds none."""
 SILENT_S = 10.0
 """Longest that a request is left without an answer; then its connection is closed."""
-"""Without a request for this long the camera is let go: the next one finds none."""
 MAX_BODY = 4096
-SPEED_LIMIT_M_S, TURN_LIMIT_RAD_S = 2.0, 3.0
-"""The server refuses commands beyond these."""
+Speed = Annotated[float, Field(strict=True, ge=-2.0, le=2.0, allow_inf_nan=False)]
+Turn = Annotated[float, Field(strict=True, ge=-3.0, le=3.0, allow_inf_nan=False)]
+_COMMAND = TypeAdapter(tuple[Speed, Speed, Turn])
+"""`[vx, vy, omega]`; the server refuses commands beyond these."""
 FREE_M = 0.41
 """What distance sensors tell with nothing near; these ones never see anything."""
 Reply = tuple[int, str, bytes]
@@ -57,8 +59,9 @@ class EmulatedRobotino:
         self._last: dict[str, bytes] = {}
         """Answers that are repeated once they are frozen."""
         self._asked_s = -math.inf
-        self._low_told_s: float | None = None
-        self._apply(faults)
+        self.robot.configure(
+            odometry=faults.odometry, watchdog_s=faults.watchdog_s, scale=faults.scale
+        )
 
     @property
     def faults(self) -> Faults:
@@ -69,8 +72,9 @@ class EmulatedRobotino:
         """Change faults by a JSON object. Raises ValueError."""
         with self._lock:
             self._faults = self._faults.changed(json.loads(body))
-            self._apply(self._faults)
-            return self._faults
+            now = self._faults
+            self.robot.configure(odometry=now.odometry, watchdog_s=now.watchdog_s, scale=now.scale)
+            return now
 
     def get(self, path: str) -> Reply:
         """Answer a GET."""
@@ -82,7 +86,7 @@ class EmulatedRobotino:
         if path == "/data/odometry":
             return self._odometry(faults)
         if path == "/data/powermanagement":
-            self._tell_battery(faults.battery_low)
+            self.robot.tell_battery(low=faults.battery_low)
             return _json(
                 {
                     "batteryLow": faults.battery_low,
@@ -105,23 +109,12 @@ class EmulatedRobotino:
         if faults.commands == "refused":
             return HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", b"busy"
         try:
-            velocity = _velocity(json.loads(body))
-        except (ValueError, RecursionError) as error:
-            return HTTPStatus.BAD_REQUEST, "text/plain", str(error).encode()
+            velocity = Velocity(*_COMMAND.validate_json(body))
+        except ValidationError as error:
+            return HTTPStatus.BAD_REQUEST, "text/plain", first_problem(error).encode()
         if method == "PUT" or not faults.post_ignored:
             self.robot.command(velocity)
         return _EMPTY
-
-    def truth(self) -> dict[str, Any]:
-        """What the robot really does, ready for JSON."""
-        return {**truth_tree(self.robot.truth()), "low_told_s": self._low_told_s}
-
-    def _tell_battery(self, low: bool) -> None:
-        """Remember when a low battery was first told."""
-        if not low:
-            self._low_told_s = None
-        elif self._low_told_s is None:
-            self._low_told_s = time.monotonic()
 
     def _camera(self, faults: Faults) -> Reply:
         now_s = time.monotonic()
@@ -132,10 +125,10 @@ class EmulatedRobotino:
             return HTTPStatus.INTERNAL_SERVER_ERROR, "text/plain", b"No jpeg image available"
         if faults.camera == "empty":
             return HTTPStatus.OK, "image/jpeg", b""
-        picture = self._kept("camera") if faults.camera == "frozen" else None
+        picture = self._last.get("camera") if faults.camera == "frozen" else None
         if picture is None:
             picture = jpeg(self.robot, faults.camera)
-            self._keep("camera", picture)
+            self._last["camera"] = picture
         if faults.camera == "truncated":
             picture = picture[: len(picture) // 2]
         return HTTPStatus.OK, "image/jpeg", picture
@@ -150,7 +143,7 @@ class EmulatedRobotino:
     def _odometry(self, faults: Faults) -> Reply:
         if faults.odometry == "empty":
             return _EMPTY
-        body = self._kept("odometry") if faults.odometry == "frozen" else None
+        body = self._last.get("odometry") if faults.odometry == "frozen" else None
         if body is None:
             now = self.robot.counted()
             values = (
@@ -158,20 +151,8 @@ class EmulatedRobotino:
                 *(now.velocity.forward_m_s, now.velocity.left_m_s, now.velocity.turn_rad_s),
             )
             body = json.dumps([*(_shortest(value) for value in values), now.sequence]).encode()
-            self._keep("odometry", body)
+            self._last["odometry"] = body
         return HTTPStatus.OK, "application/json", body
-
-    def _kept(self, name: str) -> bytes | None:
-        with self._lock:
-            return self._last.get(name)
-
-    def _keep(self, name: str, body: bytes) -> None:
-        with self._lock:
-            self._last[name] = body
-
-    def _apply(self, faults: Faults) -> None:
-        stalled = faults.odometry == "stalled"
-        self.robot.configure(stalled=stalled, watchdog_s=faults.watchdog_s, scale=faults.scale)
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -188,7 +169,7 @@ class Handler(BaseHTTPRequestHandler):
         """Readings, and what tests ask."""
         path = urlsplit(self.path).path
         if path == "/emulator/truth":
-            self._reply(_json(self.robotino.truth()))
+            self._reply(_json(self.robotino.robot.truth().tree()))
         elif path == "/emulator/faults":
             self._reply(_json(self.robotino.faults.model_dump()))
         elif self._reachable():
@@ -293,38 +274,6 @@ def jpeg(robot: EmulatedRobot, fault: str = "") -> bytes:
     done, data = cv2.imencode(".jpg", large[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     assert done
     return np.asarray(data).tobytes()
-
-
-def truth_tree(truth: Truth) -> dict[str, Any]:
-    """What an emulated robot really does, ready for JSON; times by the monotonic clock."""
-    return {
-        "now_s": truth.now_s,
-        "pose": asdict(truth.pose),
-        "velocity": asdict(truth.velocity),
-        "contact": truth.contact,
-        "still_since_s": truth.still_since_s,
-        "watchdog_stops": truth.watchdog_stops,
-        "commands": [{"at_s": g.at_s, **asdict(g.velocity)} for g in truth.commands],
-    }
-
-
-def _velocity(values: object) -> Velocity:
-    """The velocity in `[vx, vy, omega]`. Raises ValueError beyond what the server accepts."""
-    numbers = isinstance(values, list) and len(values) == 3
-    if not numbers or any(
-        isinstance(value, bool) or not isinstance(value, (int, float))
-        for value in values  # type: ignore[attr-defined]
-    ):
-        raise ValueError("expected an array of three numbers")
-    try:
-        forward, left, turn = (float(value) for value in values)  # type: ignore[attr-defined]
-    except OverflowError as error:
-        raise ValueError("velocity out of range") from error
-    if not all(math.isfinite(value) for value in (forward, left, turn)):
-        raise ValueError("expected an array of three numbers")
-    if max(abs(forward), abs(left)) > SPEED_LIMIT_M_S or abs(turn) > TURN_LIMIT_RAD_S:
-        raise ValueError("velocity out of range")
-    return Velocity(forward, left, turn)
 
 
 def _shortest(value: float) -> float | int:

@@ -15,8 +15,9 @@ class Faults(FaultSet):
 
     bumper: Literal["", "stuck", "unreadable", "nonsense"] = ""
     """stuck: pressed; unreadable: status 500; nonsense: an object without the value."""
-    odometry: Literal["", "frozen", "stalled", "empty"] = ""
-    """frozen: the same reading again and again; stalled: the motors do not turn, readings go on."""
+    odometry: Literal["", "frozen", "stalled", "constant", "empty"] = ""
+    """frozen: the same reading again and again; stalled: the motors do not turn, readings go on;
+    constant: the same pose in new readings."""
     camera: Literal["", "frozen", "500", "truncated", "empty", "noiseless", "flat"] = ""
     """noiseless: equal pictures where it stands; flat: one grey alone."""
     battery_low: bool = False

@@ -16,7 +16,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -26,7 +26,7 @@ from services.robot_driver.emulation.dynamics import CREATE3, ROBOTINO, STEP_S
 from services.robot_driver.emulation.ros2_faults import TRUTH_KEY, Ros2Faults
 from services.robot_driver.emulation.ros2_network import Network
 from services.robot_driver.emulation.world import EmulatedRobot
-from services.robot_driver.real import cdr, ros2_names
+from services.robot_driver.real import cdr, ros2_names, ros2_types
 from services.robot_driver.real.link import Battery
 from services.robot_driver.real.picture import RgbImage
 from services.robot_driver.real.ros2_types import VelocityType
@@ -45,8 +45,6 @@ STALE_STAMP_NS = 500_000_000
 SCALE = 2
 """Pictures are rendered smaller by this and scaled up."""
 QUALITY = 80
-Encode = Callable[[bool], bytes]
-"""A message in little endian (True) or big endian."""
 
 
 class EmulatedRos2:
@@ -82,14 +80,12 @@ class EmulatedRos2:
         self._inbox = RawInbox()
         self._network: Network | None = None
         self._due_s = dict.fromkeys(PERIODS_S, time.monotonic())
-        self._kept: dict[str, Encode] = {}
+        self._kept: dict[str, bytes] = {}
         self._picture: RgbImage | None = None
         self._told_pressed: bool | None = None
         self._again: deque[tuple[float, str, bytes, bytes]] = deque(maxlen=MAX_DUPLICATES)
         self._close_s, self._reopen_s = math.inf, -math.inf
         self._last_command_ns = 0
-        self._low_told_s: float | None = None
-        """When a low battery was first told."""
         try:
             self._listen = listen
             self._network = self._opened()
@@ -121,9 +117,7 @@ class EmulatedRos2:
         with self._lock:
             before, now = self._faults, self._faults.changed(changes)
             self._faults = now
-            self.robot.configure(
-                stalled=now.odometry == "stalled", watchdog_s=now.watchdog_s, scale=now.scale
-            )
+            self.robot.configure(odometry=now.odometry, watchdog_s=now.watchdog_s, scale=now.scale)
             if now.closed_s:  # after this was answered
                 self._close_s = time.monotonic() + STEP_S
                 self._reopen_s = self._close_s + now.closed_s
@@ -135,10 +129,7 @@ class EmulatedRos2:
 
     def truth(self) -> dict[str, Any]:
         """What the robot really does, and what it counted; times by the monotonic clock."""
-        truth = self.robot.truth()
-        commands = [{"at_s": given.at_s, **asdict(given.velocity)} for given in truth.commands]
-        told = {"counts": dict(self.counts), "low_told_s": self._low_told_s}
-        return {**asdict(truth), "commands": commands, **told}
+        return {**self.robot.truth().tree(), "counts": dict(self.counts)}
 
     def close(self) -> None:
         """Leave the network and free the world. May be called twice."""
@@ -240,21 +231,20 @@ class EmulatedRos2:
         state = getattr(faults, name, "")
         if state in ("silent", "muted"):
             return
-        encode = self._kept.get(name) if state == "frozen" else self._message(name, faults)
-        if encode is None and state == "frozen":
-            encode = self._message(name, faults)
-        if encode is None:
+        raw = self._kept.get(name) if state == "frozen" else None
+        raw = raw or self._message(name, faults)
+        network = self._network
+        if raw is None or network is None:
             return
-        self._kept[name] = encode
+        self._kept[name] = raw
         wrong = faults.payload if faults.payload_of in ("all", name) else ""
-        raw = encode(wrong != "big-endian")
-        if wrong == "truncated":
+        if wrong == "big-endian":
+            kind = network.kinds[name]
+            raw = ros2_types.encode(ros2_types.decode(raw, kind), kind, little_endian=False)
+        elif wrong == "truncated":
             raw = raw[: len(raw) * 2 // 3]
         elif wrong == "padded":
             raw += bytes(3)
-        network = self._network
-        if network is None:
-            return
         attachment = b"" if faults.bare else network.attachment(name)
         self._send(name, raw, attachment)
         if faults.duplicates:
@@ -268,14 +258,12 @@ class EmulatedRos2:
 
     # ------------------------------------------------------------ messages
 
-    def _message(self, name: str, faults: Ros2Faults) -> Encode | None:
+    def _message(self, name: str, faults: Ros2Faults) -> bytes | None:
         """What a sensor tells now; None: nothing."""
         stamp_ns, ros = self._now_ns(), self._ros
         if name == "odometry":
             now = self.robot.counted()
-            return lambda little: cdr.encode_odometry(
-                now.odometry, now.velocity, stamp_ns, little_endian=little
-            )
+            return cdr.encode_odometry(now.odometry, now.velocity, stamp_ns)
         if name == "bumper":
             pressed = faults.bumper in ("stuck", "lifted") or self.robot.counted().contact
             if ros.bumper_on_change and pressed == self._told_pressed:
@@ -284,23 +272,16 @@ class EmulatedRos2:
             if ros.bumper_on_change and first and not pressed:
                 return None  # it was so when the robot was switched on
             hazard = cdr.WHEEL_DROP if faults.bumper == "lifted" else cdr.BUMP
-            return lambda little: cdr.encode_bumper(
-                pressed, ros.bumper_type, stamp_ns, hazard=hazard, little_endian=little
-            )
+            return cdr.encode_bumper(pressed, ros.bumper_type, stamp_ns, hazard=hazard)
         if name == "battery":
             if not ros.battery_topic:
                 return None
-            if not faults.battery_low:
-                self._low_told_s = None
-            elif self._low_told_s is None:
-                self._low_told_s = time.monotonic()
+            self.robot.tell_battery(low=faults.battery_low)
             battery = Battery(faults.battery_low, 13.2 if faults.battery_low else 15.1)
-            return lambda little: cdr.encode_battery(
-                battery, ros.battery_type, stamp_ns, little_endian=little
-            )
+            return cdr.encode_battery(battery, ros.battery_type, stamp_ns)
         return self._camera(stamp_ns - round(faults.camera_late_s * 1e9), faults)
 
-    def _camera(self, stamp_ns: int, faults: Ros2Faults) -> Encode:
+    def _camera(self, stamp_ns: int, faults: Ros2Faults) -> bytes:
         picture = self._picture
         if picture is None or faults.camera != "restamped":
             small = self.robot.picture(faults.camera)
@@ -308,14 +289,12 @@ class EmulatedRos2:
             picture = np.asarray(cv2.resize(small, size, interpolation=cv2.INTER_LINEAR), np.uint8)
             self._picture = picture
         if self._ros.camera_type == "Image":
-            return lambda little: cdr.encode_image(picture, stamp_ns, little_endian=little)
+            return cdr.encode_image(picture, stamp_ns)
         quality = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
         done, data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), quality)
         assert done
         jpeg = np.asarray(data).tobytes()
-        return lambda little: cdr.encode_compressed_image(
-            jpeg, stamp_ns, form="rgb8; jpeg compressed bgr8", little_endian=little
-        )
+        return cdr.encode_compressed_image(jpeg, stamp_ns, form="rgb8; jpeg compressed bgr8")
 
     def _now_ns(self) -> int:
         return time.time_ns() + CLOCK_OFFSET_NS + round(self._faults.clock_step_s * 1e9)

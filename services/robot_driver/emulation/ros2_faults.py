@@ -23,8 +23,9 @@ class Ros2Faults(FaultSet):
     """No node of the base takes velocities."""
     wrong_type: bool = False
     """The base listens for the other type of velocity."""
-    odometry: Literal["", "frozen", "silent", "stalled"] = ""
-    """frozen: the same message again and again; stalled: the motors do not turn, readings go on."""
+    odometry: Literal["", "frozen", "silent", "stalled", "constant"] = ""
+    """frozen: the same message again and again; stalled: the motors do not turn, readings go on;
+    constant: the same pose in new messages."""
     camera: Literal["", "frozen", "restamped", "silent", "noiseless", "flat"] = ""
     """frozen: the same message again and again; restamped: the same picture with new stamps;
     noiseless: equal pictures where it stands; flat: one grey alone."""

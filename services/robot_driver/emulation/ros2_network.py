@@ -40,6 +40,8 @@ class Network:
         }
         if ros.battery_topic:
             sensors["battery"] = (ros.battery_topic, ros.battery_type)
+        self.kinds = {name: kind for name, (_, kind) in sensors.items()}
+        """Short names of the sensors' types."""
         for name, (topic, kind) in sensors.items():
             self.publishers[name] = bus.publisher(self._key(topic, kind))
             if name != "bumper":

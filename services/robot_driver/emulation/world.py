@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +35,13 @@ class Truth:
     """None while it moves."""
     watchdog_stops: int
     commands: tuple[Given, ...]
+    low_told_s: float | None
+    """When the robot first told that its battery is low."""
+
+    def tree(self) -> dict[str, Any]:
+        """This, ready for JSON."""
+        commands = [{"at_s": given.at_s, **asdict(given.velocity)} for given in self.commands]
+        return {**asdict(self), "commands": commands}
 
 
 @dataclass(frozen=True)
@@ -66,6 +74,8 @@ class EmulatedRobot:
         self._camera = robot.camera
         self._lock = threading.Lock()
         self._base = EmulatedBase(self._body, dynamics, time.monotonic())
+        self._constant: Pose | None = None
+        self._low_told_s: float | None = None
         self._noise = np.random.default_rng(0)
         self._done = threading.Event()
         self._thread = threading.Thread(target=self._run, name="emulated-base", daemon=True)
@@ -80,7 +90,8 @@ class EmulatedRobot:
         """Odometry, velocity, sequence number and bumper now."""
         with self._lock:
             base = self._base
-            return Counted(base.odometry, base.velocity, base.sequence, base.contact)
+            pose = self._constant or base.odometry
+            return Counted(pose, base.velocity, base.sequence, base.contact)
 
     def truth(self) -> Truth:
         """What the robot really does now."""
@@ -95,12 +106,19 @@ class EmulatedRobot:
                 still_since_s=base.still_since_s,
                 watchdog_stops=base.watchdog_stops,
                 commands=tuple(base.commands),
+                low_told_s=self._low_told_s,
             )
 
-    def configure(self, *, stalled: bool, watchdog_s: float, scale: float) -> None:
-        """Let the motors stall or turn, set the base's watchdog, and what it makes of commands."""
+    def tell_battery(self, *, low: bool) -> None:
+        """The robot tells of its battery now."""
         with self._lock:
-            self._base.stalled = stalled
+            self._low_told_s = (self._low_told_s or time.monotonic()) if low else None
+
+    def configure(self, *, odometry: str, watchdog_s: float, scale: float) -> None:
+        """Let the motors stall (`stalled`) or the odometry stand (`constant`); set the base."""
+        with self._lock:
+            self._base.stalled = odometry == "stalled"
+            self._constant = self._base.odometry if odometry == "constant" else None
             self._base.configure(watchdog_s=watchdog_s, scale=scale)
 
     def picture(self, fault: str = "") -> npt.NDArray[np.uint8]:

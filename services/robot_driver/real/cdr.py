@@ -18,7 +18,6 @@ import numpy as np
 from services.robot_driver.real.link import Battery
 from services.robot_driver.real.picture import ENCODINGS, RgbImage, decoded, raw
 from services.robot_driver.real.ros2_types import (
-    FULL_NAMES,
     BatteryType,
     BumperType,
     CameraType,
@@ -97,7 +96,7 @@ def decode_camera(data: bytes, kind: CameraType) -> Stamped[RgbImage]:
         size_px, form = (int(message.width), int(message.height)), message.encoding
         step, big_endian = int(message.step), bool(message.is_bigendian)
         pixels = raw(form, size_px, step, big_endian, message.data)
-    facts = f"{pixels.shape[1]}x{pixels.shape[0]} {form:.40}"
+    facts = f"{pixels.shape[1]}x{pixels.shape[0]} {form:.40}, "
     return Stamped(pixels, stamp_ns_of(message), facts)
 
 
@@ -163,157 +162,80 @@ def decode_velocity(data: bytes, kind: VelocityType) -> Stamped[Velocity]:
 # ---------------------------------------------------------------- to the robot, and as one
 
 
-def encode_velocity(
-    velocity: Velocity, kind: VelocityType, stamp_ns: int = 0, *, little_endian: bool = True
-) -> bytes:
+def encode_velocity(velocity: Velocity, kind: VelocityType, stamp_ns: int = 0) -> bytes:
     """A velocity command. Raises ValueError unless it is finite."""
     parts = (velocity.forward_m_s, velocity.left_m_s, velocity.turn_rad_s)
     if not all(math.isfinite(part) for part in parts):
         raise ValueError(f"velocity {parts}: expected three finite numbers")
     message = _twist(velocity)
     if kind == "TwistStamped":
-        message = new(FULL_NAMES[kind], header=header(stamp_ns, "base_link"), twist=message)
-    return encode(message, kind, little_endian)
+        message = new(kind, header(stamp_ns, "base_link"), message)
+    return encode(message, kind)
 
 
-def encode_odometry(
-    pose: Pose, velocity: Velocity, stamp_ns: int, *, little_endian: bool = True
-) -> bytes:
+def encode_odometry(pose: Pose, velocity: Velocity, stamp_ns: int) -> bytes:
     """Odometry of a base, covariances zero."""
-    half = pose.heading_rad / 2.0
-    turn = {"x": 0.0, "y": 0.0, "z": math.sin(half), "w": math.cos(half)}
-    place = new(
-        "geometry_msgs/msg/Pose",
-        position=new("geometry_msgs/msg/Point", x=pose.x_m, y=pose.y_m, z=0.0),
-        orientation=new("geometry_msgs/msg/Quaternion", **turn),
+    half, geometry = pose.heading_rad / 2.0, "geometry_msgs/msg/"
+    place = new(f"{geometry}Point", pose.x_m, pose.y_m, 0.0)
+    turn = new(f"{geometry}Quaternion", 0.0, 0.0, math.sin(half), math.cos(half))
+    covariance, here = np.zeros(36, np.float64), new(f"{geometry}Pose", place, turn)
+    parts = (
+        new(f"{geometry}PoseWithCovariance", here, covariance),
+        new(f"{geometry}TwistWithCovariance", _twist(velocity), covariance),
     )
-    covariance = np.zeros(36, np.float64)
-    message = new(
-        FULL_NAMES["Odometry"],
-        header=header(stamp_ns, "odom"),
-        child_frame_id="base_link",
-        pose=new("geometry_msgs/msg/PoseWithCovariance", pose=place, covariance=covariance),
-        twist=new(
-            "geometry_msgs/msg/TwistWithCovariance",
-            twist=_twist(velocity),
-            covariance=covariance,
-        ),
-    )
-    return encode(message, "Odometry", little_endian)
+    return encode(new("Odometry", header(stamp_ns, "odom"), "base_link", *parts), "Odometry")
 
 
 def encode_image(
-    rgb: RgbImage,
-    stamp_ns: int,
-    *,
-    encoding: str = "rgb8",
-    padding: int = 0,
-    little_endian: bool = True,
+    rgb: RgbImage, stamp_ns: int, *, encoding: str = "rgb8", padding: int = 0
 ) -> bytes:
     """An uncompressed picture; `padding` bytes follow every row."""
     height, width = rgb.shape[:2]
     rows = _from_rgb(rgb, encoding).reshape(height, width * ENCODINGS[encoding][0])
-    if padding:
-        rows = np.pad(rows, ((0, 0), (0, padding)))
-    message = new(
-        FULL_NAMES["Image"],
-        header=header(stamp_ns, "camera"),
-        height=height,
-        width=width,
-        encoding=encoding,
-        is_bigendian=0,
-        step=rows.shape[1],
-        data=np.ascontiguousarray(rows).reshape(-1),
-    )
-    return encode(message, "Image", little_endian)
+    rows = np.pad(rows, ((0, 0), (0, padding)))
+    size, data = (height, width), np.ascontiguousarray(rows).reshape(-1)
+    head = header(stamp_ns, "camera")
+    return encode(new("Image", head, *size, encoding, 0, rows.shape[1], data), "Image")
 
 
 def encode_compressed_image(
-    data: bytes,
-    stamp_ns: int,
-    *,
-    form: str = "jpeg",
-    frame_id: str = "camera",
-    little_endian: bool = True,
+    data: bytes, stamp_ns: int, *, form: str = "jpeg", frame_id: str = "camera"
 ) -> bytes:
     """A picture that is compressed already; `form` is the message's `format`."""
-    message = new(
-        FULL_NAMES["CompressedImage"],
-        header=header(stamp_ns, frame_id),
-        format=form,
-        data=np.frombuffer(data, np.uint8),
-    )
-    return encode(message, "CompressedImage", little_endian)
+    pixels = np.frombuffer(data, np.uint8)
+    message = new("CompressedImage", header(stamp_ns, frame_id), form, pixels)
+    return encode(message, "CompressedImage")
 
 
 def encode_bumper(
-    pressed: bool,
-    kind: BumperType,
-    stamp_ns: int = 0,
-    *,
-    hazard: int = BUMP,
-    little_endian: bool = True,
+    pressed: bool, kind: BumperType, stamp_ns: int = 0, *, hazard: int = BUMP
 ) -> bytes:
     """Contact as std_msgs/Bool, or as a Create 3 tells it: hazards, none when all is clear."""
     if kind == "Bool":
-        return encode(new(FULL_NAMES["Bool"], data=pressed), kind, little_endian)
-    bump = new(
-        "irobot_create_msgs/msg/HazardDetection",
-        header=header(stamp_ns, "bump_front_center"),
-        type=hazard,
-    )
-    message = new(
-        FULL_NAMES[kind],
-        header=header(stamp_ns, "base_link"),
-        detections=[bump] if pressed else [],
-    )
-    return encode(message, kind, little_endian)
+        return encode(new(kind, pressed), kind)
+    head = header(stamp_ns, "bump_front_center")
+    bump = new("irobot_create_msgs/msg/HazardDetection", head, hazard)
+    hazards = [bump] if pressed else []
+    return encode(new(kind, header(stamp_ns, "base_link"), hazards), kind)
 
 
-def encode_battery(
-    battery: Battery, kind: BatteryType, stamp_ns: int, *, little_endian: bool = True
-) -> bytes:
+def encode_battery(battery: Battery, kind: BatteryType, stamp_ns: int) -> bytes:
     """State of a battery, what is unknown as not-a-number."""
     voltage = math.nan if battery.voltage_v is None else battery.voltage_v
     head = header(stamp_ns, "base_link")
     if kind == "PowerReadings":
-        message = new(
-            FULL_NAMES[kind],
-            header=head,
-            current=0.0,
-            voltage=voltage,
-            battery_low=bool(battery.low),
-        )
-        return encode(message, kind, little_endian)
-    message = new(
-        FULL_NAMES[kind],
-        header=head,
-        voltage=voltage,
-        temperature=math.nan,
-        current=math.nan,
-        charge=math.nan,
-        capacity=math.nan,
-        design_capacity=math.nan,
-        percentage={True: LOW_CHARGE / 2.0, False: 0.8, None: math.nan}[battery.low],
-        power_supply_status=2,
-        power_supply_health=1,
-        power_supply_technology=2,
-        present=True,
-        cell_voltage=np.zeros(0, np.float32),
-        cell_temperature=np.zeros(0, np.float32),
-        location="",
-        serial_number="",
-    )
-    return encode(message, kind, little_endian)
+        return encode(new(kind, head, 0.0, voltage, bool(battery.low)), kind)
+    percentage = {True: LOW_CHARGE / 2.0, False: 0.8, None: math.nan}[battery.low]
+    unknown, cells = [math.nan] * 5, [np.zeros(0, np.float32)] * 2
+    # Discharging, of good health, with lithium ions, present.
+    message = new(kind, head, voltage, *unknown, percentage, 2, 1, 2, True, *cells, "", "")
+    return encode(message, kind)
 
 
 def _twist(velocity: Velocity) -> Any:
     v3 = "geometry_msgs/msg/Vector3"
-    return new(
-        FULL_NAMES["Twist"],
-        linear=new(v3, x=float(velocity.forward_m_s), y=float(velocity.left_m_s), z=0.0),
-        angular=new(v3, x=0.0, y=0.0, z=float(velocity.turn_rad_s)),
-    )
+    linear = new(v3, float(velocity.forward_m_s), float(velocity.left_m_s), 0.0)
+    return new("Twist", linear, new(v3, 0.0, 0.0, float(velocity.turn_rad_s)))
 
 
 def _xyz(vector: Any) -> tuple[float, float, float]:

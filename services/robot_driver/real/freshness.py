@@ -12,11 +12,13 @@ from services.robot_driver.robot import Pose
 
 DRIFT = 1e-3
 """Fastest that two clocks drift apart, in seconds a second."""
-SET_BACK_ROW = 4
-"""Messages in a row below the newest stamp, ascending, after which a clock was set back."""
+SET_ROW = 4
+"""Messages in a row of another time, ascending, after which a clock was set."""
+AHEAD_S, RECENT_S = 0.5, 10.0
+"""So long after a clock was set back, messages that seem so much faster than the fastest are still
+of the time before."""
 SEEN_S = 2.0
 """Stamps of the last seconds are remembered: a copy never shows that a clock was set back."""
-MAX_SEEN = 512
 MAX_SENDERS = 16
 """Publishers of one topic that are told apart; of more, the longest silent one is forgotten."""
 MOVED_M, MOVED_RAD = 0.01, 0.02
@@ -35,10 +37,10 @@ class RobotClock:
 
     def __init__(self) -> None:
         self.settings = 0
-        """How often the robot's clock was set back."""
+        """How often the robot's clock was set."""
         self.apart_s: float | None = None
         """Ours less the robot's; None before the first stamp."""
-        self._at_s = 0.0
+        self._at_s, self._set_s = 0.0, -math.inf
 
     def made_s(self, stamp_ns: int, arrived_s: float) -> float:
         """When a message was made, on our clock. Without a stamp (0): when it arrived."""
@@ -51,9 +53,15 @@ class RobotClock:
         self.apart_s, self._at_s = apart_s, arrived_s
         return min(stamp_ns / 1e9 + apart_s, arrived_s)
 
-    def set_back(self) -> None:
+    def of_before(self, stamp_ns: int, arrived_s: float) -> bool:
+        """Whether a stamp is of the time before the clock was set back a while ago."""
+        if self.apart_s is None or arrived_s - self._set_s > RECENT_S:
+            return False
+        return arrived_s - stamp_ns / 1e9 < self.apart_s - AHEAD_S
+
+    def set_back(self, now_s: float) -> None:
         """The robot's clock was set back: what was known of it is void."""
-        self.settings, self.apart_s = self.settings + 1, None
+        self.settings, self.apart_s, self._set_s = self.settings + 1, None, now_s
 
     def stamp_ns(self, now_s: float) -> int:
         """Now on the robot's clock, never ahead of it; 0 (no stamp) before the first message."""
@@ -65,7 +73,7 @@ class Stamps:
 
     Args:
         clock: Of the computer that stamps this topic. Topics that share it learn of each other
-            when it was set back.
+            when it was set.
     """
 
     def __init__(self, clock: RobotClock) -> None:
@@ -73,8 +81,8 @@ class Stamps:
         self._settings = clock.settings
         self._newest = 0
         self._row: list[tuple[int, float]] = []
-        """Messages since the newest that may be of a clock that was set back."""
-        self._seen: deque[tuple[int, float]] = deque(maxlen=MAX_SEEN)
+        """Messages since the newest that may be of a clock that was set."""
+        self._seen: deque[tuple[int, float]] = deque(maxlen=512)
         self.copied = False
         """Whether the message judged last was a copy of one before."""
 
@@ -90,22 +98,22 @@ class Stamps:
             return None
         if self._settings != self._clock.settings:
             self._settings, self._newest = self._clock.settings, 0
-        if stamp_ns < self._newest:
+        if stamp_ns < self._newest or self._clock.of_before(stamp_ns, arrived_s):
             if not self._in_order(stamp_ns, arrived_s):
                 return None
-            self._clock.set_back()
+            self._clock.set_back(arrived_s)
             self._settings = self._clock.settings
         self._newest, self._row = stamp_ns, []
         self._seen.append((stamp_ns, arrived_s))
         return self._clock.made_s(stamp_ns, arrived_s)
 
     def _in_order(self, stamp_ns: int, arrived_s: float) -> bool:
-        """Whether enough late messages ascend, and no faster than they arrive: no late burst."""
+        """Whether enough such messages ascend, and no faster than they arrive: no late burst."""
         if self._row and stamp_ns <= self._row[-1][0]:
             self._row = []
-        self._row = [*self._row[-SET_BACK_ROW:], (stamp_ns, arrived_s)]
+        self._row = [*self._row[-SET_ROW:], (stamp_ns, arrived_s)]
         first_ns, first_s = self._row[0]
-        enough = len(self._row) >= SET_BACK_ROW
+        enough = len(self._row) >= SET_ROW
         return enough and arrived_s - first_s >= 0.5e-9 * (stamp_ns - first_ns)
 
 

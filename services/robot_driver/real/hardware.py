@@ -107,7 +107,10 @@ class HardwareRobot(Robot):
     def feel(self) -> Felt:
         """The newest odometry and bumper. Raises NotReady when the robot is not fit to drive."""
         self._check()
-        return Felt(self._pose, _there("bumper", self._link.bumper.get()))
+        contact = _there("bumper", self._link.bumper.get())
+        if not contact:
+            self._touched(False)  # its own thread may come later than the driver
+        return Felt(self._pose, contact)
 
     def drive(self, velocity: Velocity) -> None:
         """Set the velocity, leased until `run` renews it.
@@ -199,6 +202,7 @@ class HardwareRobot(Robot):
     def _problem(self, now_s: float) -> str:
         """Why the robot must not move now; empty when it may."""
         self._look(now_s)
+        low = self.battery_low()  # whatever else is wrong: a low one is remembered
         link, ages = self._link, self._config.hardware
         for name, reading, oldest_s in (
             ("camera", link.camera.get(), ages.camera_stale_s),
@@ -211,7 +215,7 @@ class HardwareRobot(Robot):
                 return f"{name}: no reading{why}"
             if now_s - reading.stamp_s > oldest_s:
                 return f"{name}: nothing new for more than {oldest_s:g} s{why}"
-        if self.battery_low():
+        if low:
             return "battery: low"
         if obstacle := link.obstacle():
             return obstacle
@@ -236,9 +240,8 @@ class HardwareRobot(Robot):
     def _open(self) -> None:
         self._link.open()
         limit_s = self._clock() + READING_S
-        slots: tuple[Newest[Any], ...]
-        slots = (self._link.odometry, self._link.bumper, self._link.camera)
-        for slot in slots:
+        for name in ("odometry", "bumper", "camera"):
+            slot: Newest[Any] = getattr(self._link, name)
             slot.wait(0, max(limit_s - self._clock(), 0.0))
 
     def _watch(self) -> None:

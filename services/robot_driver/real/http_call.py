@@ -7,29 +7,19 @@ import math
 import select
 import socket
 import time
+from contextlib import nullcontext, suppress
 from typing import Any
 
 
 class _Socket(socket.socket):
-    """A socket that waits until a moment, and not for a time after each byte."""
+    """A socket that reads until a moment, and not for a time after each byte."""
 
     until_s = math.inf
 
     def recv_into(self, *args: Any, **options: Any) -> int:
-        """Read what is there before the moment is over."""
-        self._bound()
+        """Read what comes before the moment is over."""
+        self.settimeout(max(self.until_s - time.monotonic(), 1e-6))
         return super().recv_into(*args, **options)
-
-    def sendall(self, *args: Any) -> None:
-        """Send all before the moment is over."""
-        self._bound()
-        super().sendall(*args)
-
-    def _bound(self) -> None:
-        left_s = self.until_s - time.monotonic()
-        if left_s <= 0.0:
-            raise TimeoutError
-        self.settimeout(left_s)
 
 
 class Connection(http.client.HTTPConnection):
@@ -40,16 +30,16 @@ class Connection(http.client.HTTPConnection):
         limit_s: Longest time of a whole call: connecting, asking, head and body of the answer.
     """
 
+    sock: Any
+
     def __init__(self, address: str, limit_s: float) -> None:
         super().__init__(address, timeout=limit_s)
-        self._limit_s, self._until_s = limit_s, math.inf
+        self._limit_s = limit_s
 
     def connect(self) -> None:
-        """Connect in what is left of the time."""
-        left_s = max(self._until_s - time.monotonic(), 1e-3)
-        plain = socket.create_connection((self.host, self.port), left_s)
-        plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.sock = _Socket(fileno=plain.detach())
+        """Connect, with a socket that knows its moment."""
+        super().connect()
+        self.sock = _Socket(fileno=self.sock.detach())
 
     def call(
         self, method: str, path: str, content: bytes | None, limit: int, *, whole: bool
@@ -62,32 +52,24 @@ class Connection(http.client.HTTPConnection):
             OSError: There is no connection, or (TimeoutError) no answer in time.
             HTTPException: The answer is no HTTP, or breaks off.
         """
-        self._until_s = time.monotonic() + self._limit_s
+        until_s = time.monotonic() + self._limit_s
         if self.sock is not None and select.select([self.sock], [], [], 0.0)[0]:
             self.close()  # the other side closed it, or said what nobody asked for
         try:
             if self.sock is None:
                 self.connect()
-            assert isinstance(self.sock, _Socket)
-            self.sock.until_s = self._until_s
+            self.sock.until_s = until_s
+            self.sock.settimeout(self._limit_s)
             self.request(method, path, content, {"Content-Type": "application/json"})
             reply = self.getresponse()
-            body = self._body(reply, limit, whole=whole)
+            body = b""
+            with nullcontext() if whole else suppress(OSError, http.client.HTTPException):
+                body = reply.read(limit + 1)
+            if not reply.isclosed():  # too long, cut off, or still on its way
+                self.close()
+            if whole and reply.length and len(body) <= limit:
+                raise http.client.IncompleteRead(body)
         except BaseException:
             self.close()
             raise
         return reply.status, body
-
-    def _body(self, reply: http.client.HTTPResponse, limit: int, *, whole: bool) -> bytes:
-        try:
-            body = reply.read(limit + 1)
-            if reply.length and len(body) <= limit:
-                raise http.client.IncompleteRead(body)
-        except (OSError, http.client.HTTPException):
-            self.close()
-            if whole:
-                raise
-            return b""
-        if len(body) > limit:
-            self.close()
-        return body

@@ -6,15 +6,17 @@ A link has threads or callbacks of its own that put the newest readings into slo
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from services.robot_driver.robot import Pose, Velocity
 from shared.messages import ImageArray
 
 T = TypeVar("T")
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,38 @@ class Battery:
     """None where the robot does not tell, or tells nonsense."""
     charge: float | None = field(default=None, compare=False)
     """As told, a part of a full one or percent; None where the robot tells none."""
+
+
+class Slots:
+    """The slots of a link, and the count of what did not get into them."""
+
+    def __init__(self) -> None:
+        self.camera: Newest[ImageArray] = Newest()
+        self.odometry: Newest[Pose] = Newest()
+        self.bumper: Newest[bool] = Newest()
+        self.battery: Newest[Battery] = Newest()
+        self.faults: Counter[str] = Counter()
+        self._counting = threading.Lock()
+
+    def refuse(self, name: str, why: str, *, heard: bool = True) -> None:
+        """Count what was no reading, and let its slot say why.
+
+        What was heard of bumper or battery and cannot be read ends what was read before.
+        """
+        slot: Newest[Any] = getattr(self, name)
+        if heard and name in ("bumper", "battery"):
+            slot.void(why)
+        slot.note = why
+        self.count(name, why)
+
+    def count(self, name: str, why: str) -> None:
+        """Count by reason; log when the count is 1, 2, 4, 8 ...: visible, never a flood."""
+        fault = f"{name}: {why.split(':')[0]}"
+        with self._counting:
+            self.faults[fault] += 1
+            count = self.faults[fault]
+        if count & (count - 1) == 0:
+            log.warning("%s refused (%d so far): %s", name, count, why)
 
 
 class Link(Protocol):

@@ -12,11 +12,9 @@ SPEED_M_S, TURN_RAD_S = 3.0, 6.0
 SLACK_M, SLACK_RAD = 0.2, 0.5
 STILL_M, STILL_RAD = 0.003, 0.01
 """A robot that moved less has not moved."""
-FREE_M, FREE_RAD = 0.05, 0.15
-"""Motion that nobody ordered, within `WINDOW_S`, which is put down to slip and noise."""
-EXCESS = 1.5
-"""A robot may move farther than ordered by this factor."""
-WINDOW_S = 1.0
+WINDOW_S, FREE_M, FREE_RAD, EXCESS = 1.0, 0.05, 0.15, 1.5
+"""Within this time a robot may move so much that nobody ordered, by slip and noise, and farther
+than ordered by this factor."""
 LATE_S = 0.5
 """Longest that an order needs until it shows in the odometry, beside the time to rest."""
 LEASE_S = 0.2

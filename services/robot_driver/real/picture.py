@@ -20,19 +20,11 @@ from shared.facts import IMAGE_HEIGHT, IMAGE_WIDTH
 RgbImage = npt.NDArray[np.uint8]
 MAX_SIDE_PX = 4096
 ENCODINGS: dict[str, tuple[int, tuple[int, ...]]] = {
-    "mono8": (1, (0,)),
-    "8UC1": (1, (0,)),
-    "mono16": (2, (1,)),
-    "rgb8": (3, (0, 1, 2)),
-    "bgr8": (3, (2, 1, 0)),
-    "8UC3": (3, (2, 1, 0)),
-    "rgba8": (4, (0, 1, 2)),
-    "bgra8": (4, (2, 1, 0)),
-    "yuv422": (2, (1,)),
-    "uyvy": (2, (1,)),
-    "yuv422_yuy2": (2, (0,)),
-    "yuyv": (2, (0,)),
-    "nv12": (1, (0,)),
+    **dict.fromkeys(("mono8", "8UC1", "nv12"), (1, (0,))),
+    **dict.fromkeys(("mono16", "yuv422", "uyvy"), (2, (1,))),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, (0,))),
+    **{"rgb8": (3, (0, 1, 2)), "bgr8": (3, (2, 1, 0)), "8UC3": (3, (2, 1, 0))},
+    **{"rgba8": (4, (0, 1, 2)), "bgra8": (4, (2, 1, 0))},
 }
 """Raw pictures by the name of their encoding: bytes of a pixel, and which of them are red, green
 and blue, or grey alone. Of YUV the brightness is enough, because the network sees grey."""
@@ -48,8 +40,6 @@ def decoded(data: bytes) -> RgbImage:
         BadMessage: It is neither, is larger than `MAX_SIDE_PX` either way, or is damaged, where
             other decoders would fill in what is missing.
     """
-    if not data:
-        raise BadMessage("empty")
     if not data.startswith((_JPEG, _PNG)):
         raise BadMessage("neither JPEG nor PNG")
     try:

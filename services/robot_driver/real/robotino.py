@@ -7,19 +7,16 @@ import json
 import logging
 import threading
 import time
-from collections import Counter
 from http import HTTPStatus
-from typing import Any
 
 from services.robot_driver.real import robotino_replies as replies
 from services.robot_driver.real.freshness import Pictures
 from services.robot_driver.real.http_call import Connection
-from services.robot_driver.real.link import Battery, Newest
+from services.robot_driver.real.link import Slots
 from services.robot_driver.real.picture import decoded
-from services.robot_driver.robot import Pose, RobotFault, Velocity
+from services.robot_driver.robot import RobotFault, Velocity
 from shared.config import Config
 from shared.errors import BadMessage, ConfigError
-from shared.messages import ImageArray
 from shared.rl.preprocess import preprocess
 
 log = logging.getLogger(__name__)
@@ -30,7 +27,7 @@ LABEL = "?sid=corridor"
 """Names this client to the robot; it needs no login."""
 
 
-class RobotinoLink:
+class RobotinoLink(Slots):
     """A Robotino as `link.Link`.
 
     Args:
@@ -41,14 +38,9 @@ class RobotinoLink:
     """
 
     def __init__(self, config: Config) -> None:
+        super().__init__()
         self._config = robotino = config.robot.robotino
         self._open_timeout_s = config.robot.hardware.open_timeout_s
-        self.camera: Newest[ImageArray] = Newest()
-        self.odometry: Newest[Pose] = Newest()
-        self.bumper: Newest[bool] = Newest()
-        self.battery: Newest[Battery] = Newest()
-        self.faults: Counter[str] = Counter()
-        self._counting = threading.Lock()
         self._answered, self._done = threading.Event(), threading.Event()
         self._threads: list[threading.Thread] = []
         port = robotino.address.rpartition(":")[2]
@@ -58,7 +50,7 @@ class RobotinoLink:
             )
         command_s = min(robotino.timeout_s, config.robot.hardware.command_period_s)
         self._commands = Connection(robotino.address, command_s)
-        self._sequence: int | None = None
+        self._sequence: float | None = None
         self._pictures = Pictures()
 
     def open(self) -> None:
@@ -98,9 +90,9 @@ class RobotinoLink:
             path, limit = "/data/omnidrive" + LABEL, replies.MAX_JSON_BYTES
             status, _ = self._commands.call("PUT", path, content, limit, whole=False)
         except (OSError, http.client.HTTPException, ValueError) as error:
-            raise self._fault("command", _reason(error)) from error
+            raise self._fault(_reason(error)) from error
         if status != HTTPStatus.OK:
-            raise self._fault("command", f"status {status}")
+            raise self._fault(f"status {status}")
 
     def close(self) -> None:
         """Stop reading and disconnect. May be called twice."""
@@ -121,7 +113,7 @@ class RobotinoLink:
             try:
                 status, body = connection.call("GET", path, None, limit, whole=True)
             except (OSError, http.client.HTTPException, ValueError) as error:
-                self._refuse(name, _reason(error), void=False)
+                self.refuse(name, _reason(error), heard=False)
             else:
                 self._answered.set()
                 self.take(name, status, body if len(body) <= limit else None, began_s)
@@ -139,10 +131,10 @@ class RobotinoLink:
                 raise BadMessage("too large")
             getattr(self, f"_take_{name}")(body, began_s)
         except BadMessage as error:
-            self._refuse(name, str(error), void=name in ("bumper", "battery"))
+            self.refuse(name, str(error))
         except Exception as error:  # one odd answer must not end all reading
             log.exception("%s: could not be read", name)
-            self._refuse(name, type(error).__name__, void=True)
+            self.refuse(name, type(error).__name__)
 
     def _take_camera(self, body: bytes, began_s: float) -> None:
         picture, here = decoded(body), self.odometry.get()
@@ -164,18 +156,9 @@ class RobotinoLink:
     def _take_battery(self, body: bytes, began_s: float) -> None:
         self.battery.put(replies.battery(body), began_s)
 
-    def _refuse(self, name: str, why: str, *, void: bool) -> None:
-        """Count what was no reading, and let its slot say why."""
-        slot: Newest[Any] = getattr(self, name)
-        self._fault(name, why.split(":")[0])
-        if void:
-            slot.void(why)
-        slot.note = why
-
-    def _fault(self, name: str, reason: str) -> RobotFault:
-        with self._counting:
-            self.faults[f"{name}: {reason}"] += 1
-        return RobotFault(f"{name}: {reason}")
+    def _fault(self, reason: str) -> RobotFault:
+        self.count("command", reason)
+        return RobotFault(f"command: {reason}")
 
 
 def _reason(error: Exception) -> str:

@@ -41,6 +41,7 @@ class Ros2Link(Ros2Sensors):
     def __init__(self, config: Config) -> None:
         super().__init__(config.robot.ros2)
         self._hardware = config.robot.hardware
+        self._epoch_s = time.time() - time.monotonic()
         self._changes_seen = -1
         self._inbox = RawInbox()
         self._bus: ForeignBus | None = None
@@ -89,7 +90,7 @@ class Ros2Link(Ros2Sensors):
             if obstacle:
                 raise RobotFault(obstacle)
         except RobotFault as error:
-            self.faults[f"command: {str(error).split(':')[0]}"] += 1
+            self.count("command", str(error))
             raise
 
     def _publish(self, velocity: Velocity, kind: VelocityType) -> None:
@@ -188,7 +189,7 @@ class Ros2Link(Ros2Sensors):
         for name, count in self._inbox.refused.copy().items():
             fault = f"{name}: too long or too many"
             if name in KEPT and count > self.faults[fault]:
-                self._refuse(name, "too long or too many")
+                self.refuse(name, "too long or too many")
                 self.faults[fault] = count
 
     # ------------------------------------------------------------ the robot's clock

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import logging
 import math
-from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 from services.robot_driver.real import cdr, ros2_names, ros2_types
+from services.robot_driver.real.cdr import Stamped
 from services.robot_driver.real.freshness import Pictures, RobotClock, Sequences, Stamps
-from services.robot_driver.real.link import Battery, Newest
+from services.robot_driver.real.link import Newest, Slots
 from services.robot_driver.real.ros2_names import Endpoint
-from services.robot_driver.robot import Pose
 from shared.config import Ros2Config
 from shared.errors import BadMessage
 from shared.foreign_bus import RawSample
-from shared.messages import ImageArray
 from shared.rl.preprocess import preprocess
 
 log = logging.getLogger(__name__)
@@ -30,7 +29,7 @@ AT_A_PERIOD = "set hazards_pub_fixed_period_ms to 50 on the base"
 PRESS = f"press it once, or {AT_A_PERIOD} and robot.ros2.bumper_on_change to false"
 
 
-class Ros2Sensors:
+class Ros2Sensors(Slots):
     """The sensors of a ROS 2 robot: slots of `link.Link`, and what is known of their messages.
 
     A bumper that is published on change alone is silent for hours. Once it was heard, every new
@@ -39,14 +38,9 @@ class Ros2Sensors:
     """
 
     def __init__(self, ros: Ros2Config) -> None:
+        super().__init__()
         self._ros = ros
-        self.camera: Newest[ImageArray] = Newest()
-        self.odometry: Newest[Pose] = Newest()
-        self.bumper: Newest[bool] = Newest()
-        self.battery: Newest[Battery] = Newest()
-        self.faults: Counter[str] = Counter()
-        parts = ("velocity", *SENSORS)
-        topics = {part: getattr(ros, f"{part}_topic") for part in parts}
+        topics = {part: getattr(ros, f"{part}_topic") for part in ("velocity", *SENSORS)}
         self._topics = {
             part: ros2_names.full_topic(ros.namespace, topic)
             for part, topic in topics.items()
@@ -58,6 +52,12 @@ class Ros2Sensors:
             "camera": ros.camera_type,
             "battery": ros.battery_type,
         }
+        self._decoders: dict[str, Callable[[bytes], Stamped[Any]]] = {
+            "bumper": lambda raw: cdr.decode_bumper(raw, ros.bumper_type),
+            "odometry": cdr.decode_odometry,
+            "camera": lambda raw: cdr.decode_camera(raw, ros.camera_type),
+            "battery": lambda raw: cdr.decode_battery(raw, ros.battery_type, percent=self._percent),
+        }
         self._robot_clock = RobotClock()
         own = RobotClock() if ros.camera_clock == "own" else self._robot_clock
         self._clocks = {**dict.fromkeys(SENSORS, self._robot_clock), "camera": own}
@@ -65,25 +65,30 @@ class Ros2Sensors:
         self._sequences = {name: Sequences() for name in SENSORS}
         self._pictures = Pictures()
         self._endpoints: frozenset[Endpoint] = frozenset()
-        self._pressed: bool | None = None
         self._bumper_told = False
         """Whether the network ever told of somebody who publishes the bumper."""
         self._touch_until_s = -math.inf
         self._percent = False
         """Whether the battery told its charge in percent."""
         self._hints: dict[str, str] = {}
+        self._epoch_s = 0.0
+        """The time of day less our monotonic clock."""
 
     def take(self, name: str, sample: RawSample, now_s: float) -> None:
         """Take one message; what cannot be read, repeats or comes late is counted."""
-        pressed = self._pressed
+        before = self.bumper.get()
         try:
-            getattr(self, f"_take_{name}")(sample)
+            read = self._decoders[name](sample.payload)
+            made_s = self._made_s(name, sample, read.stamp_ns)
+            if made_s is not None:
+                self._accept(name, read, sample, made_s)
         except BadMessage as error:
-            self._refuse(name, str(error))
+            self.refuse(name, str(error))
         except Exception as error:  # one odd message must not end all reading
             log.exception("%s: could not be taken", name)
-            self._refuse(name, type(error).__name__)
-        if self._pressed and not pressed:
+            self.refuse(name, type(error).__name__)
+        after = self.bumper.get()
+        if after is not None and after.value and not (before is not None and before.value):
             self._touch_until_s = now_s + TOUCH_S
 
     def _wrong_sensor(self) -> str:
@@ -95,21 +100,22 @@ class Ros2Sensors:
                 return f"robot publishes {types} on {topic}, configured {self._kinds[name]}"
         return ""
 
-    def _take_bumper(self, sample: RawSample) -> None:
-        read = cdr.decode_bumper(sample.payload, self._ros.bumper_type)
-        made_s = self._made_s("bumper", sample, read.stamp_ns)
-        if made_s is None:
-            return
-        self._pressed = read.value
-        self._put("bumper", read.value, sample, made_s)
-
-    def _take_odometry(self, sample: RawSample) -> None:
-        read = cdr.decode_odometry(sample.payload)
-        made_s = self._made_s("odometry", sample, read.stamp_ns)
-        if made_s is None:
-            return
-        self._put("odometry", read.value, sample, made_s)
-        if self._ros.bumper_on_change:
+    def _accept(self, name: str, read: Stamped[Any], sample: RawSample, made_s: float) -> None:
+        """Put a new reading, with how long it took and how far the robot's clock is from ours."""
+        value = read.value
+        if name == "camera":
+            here = self.odometry.get()
+            if not self._pictures.new(value, here.value if here else None, made_s):
+                raise BadMessage("the same picture although the robot moved")
+            value = preprocess(value)
+        elif name == "battery":
+            self._percent |= (value.charge or 0.0) > cdr.FULL
+        apart_s, behind_s = self._clocks[name].apart_s, sample.arrived_s - made_s
+        skew = "no stamps" if apart_s is None else f"clock {-apart_s - self._epoch_s:+.3f} s"
+        slot: Newest[Any] = getattr(self, name)
+        slot.put(value, made_s, f"{read.facts}{behind_s:.3f} s on its way, {skew}")
+        slot.note = BEHIND if behind_s > BEHIND_S else ""
+        if name == "odometry" and self._ros.bumper_on_change:
             self._confirm_bumper(made_s)
 
     def _confirm_bumper(self, made_s: float) -> None:
@@ -117,26 +123,9 @@ class Ros2Sensors:
         there = ros2_names.types_on(self._endpoints, "publishes", self._topics["bumper"])
         self._bumper_told |= bool(there)
         # Where the network tells who publishes, a publisher that went takes the all-clear with it.
-        if self._pressed is not None and (there or not (self._bumper_told or self._endpoints)):
-            self.bumper.put(self._pressed, made_s)
-
-    def _take_battery(self, sample: RawSample) -> None:
-        kind = self._ros.battery_type
-        read = cdr.decode_battery(sample.payload, kind, percent=self._percent)
-        made_s = self._made_s("battery", sample, read.stamp_ns)
-        if made_s is not None:
-            self._percent |= (read.value.charge or 0.0) > cdr.FULL
-            self._put("battery", read.value, sample, made_s)
-
-    def _take_camera(self, sample: RawSample) -> None:
-        read = cdr.decode_camera(sample.payload, self._ros.camera_type)
-        made_s = self._made_s("camera", sample, read.stamp_ns)
-        if made_s is None:
-            return
-        here = self.odometry.get()
-        if not self._pictures.new(read.value, here.value if here else None, made_s):
-            raise BadMessage("the same picture although the robot moved")
-        self._put("camera", preprocess(read.value), sample, made_s, f"{read.facts}, ")
+        last = self.bumper.get()
+        if last is not None and (there or not (self._bumper_told or self._endpoints)):
+            self.bumper.put(last.value, made_s)
 
     def _made_s(self, name: str, sample: RawSample, stamp_ns: int) -> float | None:
         """When a sample was made, on our clock; None for one that repeats or comes late.
@@ -149,24 +138,14 @@ class Ros2Sensors:
             if attachment is None:
                 raise BadMessage("without the attachment of rmw_zenoh")
             if not self._sequences[name].new(attachment.gid, attachment.sequence):
-                self._fault(name, "repeated or late")
+                self.count(name, "repeated or late")
                 return None
         made_s = stamps.made_s(stamp_ns, sample.arrived_s)
         if made_s is None and name == "bumper" and not stamps.copied:
             raise BadMessage("repeated or late")
         if made_s is None:
-            self._fault(name, "repeated or late")
+            self.count(name, "repeated or late")
         return made_s
-
-    def _put(
-        self, name: str, value: Any, sample: RawSample, made_s: float, facts: str = ""
-    ) -> None:
-        """Put a reading, with how long it took and how far the robot's clock is from ours."""
-        apart_s, behind_s = self._clocks[name].apart_s, sample.arrived_s - made_s
-        clock = "no stamps" if apart_s is None else f"robot's clock {-apart_s:+.3f} s from ours"
-        slot: Newest[Any] = getattr(self, name)
-        slot.put(value, made_s, f"{facts}{behind_s:.3f} s on its way, {clock}")
-        slot.note = BEHIND if behind_s > BEHIND_S else ""
 
     def explain(self) -> None:
         """Let sensors without a reading say what the network tells of them, or what to do."""
@@ -182,24 +161,3 @@ class Ros2Sensors:
         if name == "bumper" and self._ros.bumper_on_change:
             return PRESS
         return AT_A_PERIOD if self._kinds[name] == "HazardDetectionVector" else "nothing heard"
-
-    def _refuse(self, name: str, why: str) -> None:
-        """Count what was no reading, and let its slot say why.
-
-        A message of the bumper or of the battery that cannot be read ends what was read before.
-        """
-        slot: Newest[Any] = getattr(self, name)
-        if name in ("bumper", "battery"):
-            slot.void(why)
-        if name == "bumper":
-            self._pressed = None
-        slot.note = why
-        self._fault(name, why)
-
-    def _fault(self, name: str, why: str) -> None:
-        """Count by reason; log when the count is 1, 2, 4, 8 ...: visible, never a flood."""
-        fault = f"{name}: {why.split(':')[0]}"
-        self.faults[fault] += 1
-        count = self.faults[fault]
-        if count & (count - 1) == 0:
-            log.warning("%s refused (%d so far): %s", name, count, why)

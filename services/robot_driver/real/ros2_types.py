@@ -76,12 +76,12 @@ def _store() -> Any:
     return store
 
 
-def new(full_name: str, **fields: Any) -> Any:
-    """A message of a type, by its full name."""
-    return _store().types[full_name](**fields)
+def new(name: str, *fields: Any) -> Any:
+    """A message of a type by its short or full name, its fields in the order of the wire."""
+    return _store().types[FULL_NAMES.get(name, name)](*fields)
 
 
-def encode(message: Any, kind: str, little_endian: bool) -> bytes:
+def encode(message: Any, kind: str, *, little_endian: bool = True) -> bytes:
     """CDR of a message; kind: short name of its type."""
     return bytes(_store().serialize_cdr(message, FULL_NAMES[kind], little_endian=little_endian))
 
@@ -106,8 +106,8 @@ def decode(raw: bytes, kind: str) -> Any:
 def header(stamp_ns: int, frame_id: str) -> Any:
     """A message's header."""
     seconds, nanoseconds = divmod(stamp_ns, _S_NS)
-    stamp = new("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
-    return new("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+    stamp = new("builtin_interfaces/msg/Time", seconds, nanoseconds)
+    return new("std_msgs/msg/Header", stamp, frame_id)
 
 
 def stamp_ns_of(message: Any) -> int:

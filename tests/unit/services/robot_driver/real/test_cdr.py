@@ -36,6 +36,14 @@ def stamp(ns: int) -> dict[str, int]:
     return {"sec": ns // 10**9, "nanosec": ns % 10**9}
 
 
+HAZARDS: ros2_types.BumperType = "HazardDetectionVector"
+
+
+def ordered(raw: bytes, kind: str, little: bool) -> bytes:
+    """The same message in little or big endian."""
+    return ros2_types.encode(ros2_types.decode(raw, kind), kind, little_endian=little)
+
+
 def told(message: dict[str, Any]) -> int:
     now = message["header"]["stamp"]
     return int(now["sec"] * 10**9 + now["nanosec"])
@@ -105,10 +113,10 @@ def test_velocities_are_read_by_others(
     expected = naive_cdr.plain("Twist")
     expected["linear"].update(x=forward, y=left)
     expected["angular"]["z"] = turn
-    raw = cdr.encode_velocity(velocity, "Twist", little_endian=little)
+    raw = ordered(cdr.encode_velocity(velocity, "Twist"), "Twist", little)
     assert naive_cdr.decode(raw, "Twist") == expected
     assert cdr.decode_velocity(raw, "Twist") == cdr.Stamped(velocity, 0)
-    raw = cdr.encode_velocity(velocity, "TwistStamped", ns, little_endian=little)
+    raw = ordered(cdr.encode_velocity(velocity, "TwistStamped", ns), "TwistStamped", little)
     header = {"stamp": stamp(ns), "frame_id": "base_link"}
     assert naive_cdr.decode(raw, "TwistStamped") == {"header": header, "twist": expected}
     assert cdr.decode_velocity(raw, "TwistStamped") == cdr.Stamped(velocity, ns)
@@ -120,7 +128,7 @@ def test_odometry_is_read_by_others(
     x: float, y: float, heading: float, ns: int, little: bool
 ) -> None:
     velocity = Velocity(0.1, 0.2, 0.3)
-    raw = cdr.encode_odometry(Pose(x, y, heading), velocity, ns, little_endian=little)
+    raw = ordered(cdr.encode_odometry(Pose(x, y, heading), velocity, ns), "Odometry", little)
     message = naive_cdr.decode(raw, "Odometry")
     assert told(message) == ns
     assert message["pose"]["pose"]["position"] == {"x": x, "y": y, "z": 0.0}
@@ -175,7 +183,7 @@ def test_pictures_are_read_by_others_and_of_others(
     rgb = np.frombuffer(random.randbytes(height * width * 3), np.uint8).reshape(height, width, 3)
     if encoding == "mono8":
         rgb = np.repeat(rgb[:, :, :1], 3, axis=2)
-    raw = cdr.encode_image(rgb, ns, encoding=encoding, padding=padding, little_endian=little)
+    raw = ordered(cdr.encode_image(rgb, ns, encoding=encoding, padding=padding), "Image", little)
     message = naive_cdr.decode(raw, "Image")
     channels = {"mono8": 1, "rgba8": 4, "bgra8": 4}.get(encoding, 3)
     assert told(message) == ns
@@ -197,7 +205,7 @@ def test_pictures_are_read_by_others_and_of_others(
 def test_compressed_pictures_are_read_by_others(
     data: bytes, form: str, ns: int, little: bool
 ) -> None:
-    raw = cdr.encode_compressed_image(data, ns, form=form, little_endian=little)
+    raw = ordered(cdr.encode_compressed_image(data, ns, form=form), "CompressedImage", little)
     message = naive_cdr.decode(raw, "CompressedImage")
     assert (told(message), message["format"], bytes(message["data"])) == (ns, form, data)
 
@@ -217,9 +225,9 @@ def test_compressed_pictures_of_others_are_read(form: str) -> None:
 @FAST
 @given(st.booleans(), stamps, orders)
 def test_bumpers_are_read_by_others(pressed: bool, ns: int, little: bool) -> None:
-    raw = cdr.encode_bumper(pressed, "Bool", little_endian=little)
+    raw = ordered(cdr.encode_bumper(pressed, "Bool"), "Bool", little)
     assert naive_cdr.decode(raw, "Bool") == {"data": pressed}
-    raw = cdr.encode_bumper(pressed, "HazardDetectionVector", ns, little_endian=little)
+    raw = ordered(cdr.encode_bumper(pressed, HAZARDS, ns), HAZARDS, little)
     message = naive_cdr.decode(raw, "HazardDetectionVector")
     assert told(message) == ns
     assert [detection["type"] for detection in message["detections"]] == [1] * pressed
@@ -255,7 +263,7 @@ def test_batteries_are_read_by_others_and_of_others(
     low: bool, voltage: float | None, ns: int, little: bool
 ) -> None:
     for kind in ("BatteryState", "PowerReadings"):
-        raw = cdr.encode_battery(Battery(low, voltage), kind, ns, little_endian=little)
+        raw = ordered(cdr.encode_battery(Battery(low, voltage), kind, ns), kind, little)
         message = naive_cdr.decode(raw, kind)
         assert told(message) == ns
         assert message["voltage"] == voltage or math.isnan(message["voltage"])
@@ -515,7 +523,7 @@ def test_depth_and_broken_off_pictures_are_refused() -> None:
         ("32FC1; compressedDepth", data, "depth"),
         ("jpeg", data[: len(data) // 2], "cut off"),
         ("jpeg", b"GIF89a", "neither"),
-        ("jpeg", b"", "empty"),
+        ("jpeg", b"", "neither"),
     ):
         raw = cdr.encode_compressed_image(content, STAMP_NS, form=form)
         with pytest.raises(BadMessage, match=reason):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from services.robot_driver.real.freshness import (
     REST_S,
-    SET_BACK_ROW,
+    SET_ROW,
     Pictures,
     RobotClock,
     Sequences,
@@ -96,7 +96,7 @@ def test_a_clock_that_was_set_back_is_followed_after_a_few_messages(step_s: floa
         if odometry.made_s(stamp_ns(ROBOT_S + at_s - step_s + 0.001), at_s + WAY_S) is not None:
             break
         refused += 1
-    assert refused == SET_BACK_ROW - 1
+    assert refused == SET_ROW - 1
     pressed_s = bumper.made_s(stamp_ns(ROBOT_S + at_s - step_s), at_s + WAY_S)
     assert pressed_s == pytest.approx(at_s + WAY_S, abs=0.01), "what shares the clock follows"
     assert clock.stamp_ns(at_s) == pytest.approx(stamp_ns(ROBOT_S + at_s - step_s), abs=S_NS // 10)
@@ -120,6 +120,17 @@ def test_a_burst_of_late_messages_is_no_clock_that_was_set_back() -> None:
     burst = [stamp_ns(ROBOT_S - 5.0 + tick * PERIOD_S) for tick in range(50)]
     assert [judge.made_s(stamp, 0.01) for stamp in burst] == [None] * 50
     assert not judge.copied
+
+
+def test_what_is_still_of_the_time_before_a_clock_was_set_back_is_not_new() -> None:
+    clock = RobotClock()
+    odometry, camera = judge_of(clock), judge_of(clock)
+    for tick in range(60):
+        back_s = 50.001 if tick >= 40 else 0.0
+        odometry.made_s(stamp_ns(ROBOT_S + tick * PERIOD_S - back_s), tick * PERIOD_S)
+    assert camera.made_s(stamp_ns(ROBOT_S + 39 * PERIOD_S), 60 * PERIOD_S) is None
+    made_s = odometry.made_s(stamp_ns(ROBOT_S + 60 * PERIOD_S - 50.001), 60 * PERIOD_S)
+    assert made_s == pytest.approx(60 * PERIOD_S, abs=0.01)
 
 
 def test_numbers_grow_by_sender() -> None:

@@ -135,7 +135,7 @@ def test_what_cannot_be_read_is_not_what_was_read_before() -> None:
         link.take(name, 200, b"garbage", 3.0)
     assert (link.bumper.get(), link.battery.get()) == (None, None)
     assert link.odometry.get() == readings[1]
-    assert link.odometry.note == link.bumper.note == "not JSON"
+    assert "not as expected" in link.odometry.note
 
 
 def test_a_frozen_camera_is_found_out_when_the_robot_moves() -> None:

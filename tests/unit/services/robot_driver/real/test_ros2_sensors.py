@@ -83,7 +83,7 @@ def test_a_battery_speaks_percent_once_it_told_more_than_one() -> None:
         if charge is not None:
             message = ros2_types.decode(raw, "BatteryState")
             raw = ros2_types.encode(
-                type(message)(**{**vars(message), "percentage": charge}), "BatteryState", True
+                type(message)(**{**vars(message), "percentage": charge}), "BatteryState"
             )
         say(sensors, "battery", raw if charge is not None else raw[:-9], 1.0)
         reading = sensors.battery.get()
