@@ -219,20 +219,10 @@ class RobotConfig(Section):
     radius_m: float = Field(default=0.225, gt=0.0, le=1.0)
     """Radius of the round shell with the bumper."""
     camera: CameraConfig = CameraConfig()
+    calibration: CalibrationConfig = CalibrationConfig()
     hardware: HardwareConfig = HardwareConfig()
     robotino: RobotinoConfig = RobotinoConfig()
     ros2: Ros2Config = Ros2Config()
-    calibration: CalibrationConfig = CalibrationConfig()
-
-    @property
-    def step_m(self) -> float:
-        """Way of an action, as far as is known."""
-        return (self.calibration.speed_m_s or self.speed_m_s) * self.period_s
-
-    @property
-    def step_rad(self) -> float:
-        """Turn of an action that turns fully, as far as is known."""
-        return (self.calibration.turn_rad_s or self.turn_rad_s) * self.period_s
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -260,6 +250,16 @@ class RobotConfig(Section):
                 f"({self.period_s})"
             )
         return self
+
+    @property
+    def step_m(self) -> float:
+        """Way of an action, as far as is known."""
+        return (self.calibration.speed_m_s or self.speed_m_s) * self.period_s
+
+    @property
+    def step_rad(self) -> float:
+        """Turn of an action that turns fully, as far as is known."""
+        return (self.calibration.turn_rad_s or self.turn_rad_s) * self.period_s
 
 
 class EpisodeConfig(Section):

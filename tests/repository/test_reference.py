@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import reference
 
-from shared import messages, reference
+from shared import messages
 from shared.keys import ALIVE_PATTERN, STREAMS
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -15,7 +16,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 @pytest.mark.parametrize("name", ["protocol.md", "configuration.md"])
 def test_generated_tables_are_up_to_date(name: str) -> None:
     page = (DOCS / name).read_text()
-    assert reference.renewed(page) == page, f"run: python -m shared.reference docs/{name}"
+    assert reference.renewed(page) == page, f"run: python -m tests.reference docs/{name}"
 
 
 def test_protocol_names_every_stream_message_and_the_version() -> None:

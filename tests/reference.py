@@ -1,6 +1,6 @@
 """Reference tables made from the code: streams, messages, configuration.
 
-`python -m shared.reference docs/protocol.md docs/configuration.md` renews the generated parts of
+`python -m tests.reference docs/protocol.md docs/configuration.md` renews the generated parts of
 these pages; a test compares them with the code.
 """
 
