@@ -204,7 +204,6 @@ class ForeignBus:
                 mode,
                 connect=[endpoint] if client else [],
                 listen=[] if client else [endpoint],
-                shared_memory=False,
             )
         except zenoh.ZError as error:
             raise ConfigError(

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import logging
 import re
 from collections.abc import Sequence
 
 import zenoh
+
+log = logging.getLogger(__name__)
 
 
 def zenoh_config(
@@ -15,7 +18,7 @@ def zenoh_config(
     connect: Sequence[str] = (),
     listen: Sequence[str] = (),
     lease_ms: int = 2000,
-    shared_memory: bool = True,
+    shared_memory: bool = False,
     credentials: str = "",
 ) -> zenoh.Config:
     """A closed configuration: no scouting, explicit endpoints, quick reconnection.
@@ -44,6 +47,27 @@ def zenoh_config(
     }.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def open_client(
+    endpoint: str, lease_ms: int, credentials: str, shared_memory: bool
+) -> zenoh.Session:
+    """A session with a router; without shared memory where there is no room. Raises ZError."""
+    try:
+        return zenoh.open(
+            zenoh_config(
+                "client",
+                connect=[endpoint],
+                lease_ms=lease_ms,
+                shared_memory=shared_memory,
+                credentials=credentials,
+            )
+        )
+    except BaseException as error:  # a panic of Zenoh is no Exception
+        if not shared_memory or "shm" not in str(error).lower():
+            raise
+        log.warning("messages go without shared memory: %s", error)
+        return open_client(endpoint, lease_ms, credentials, shared_memory=False)
 
 
 def _tls(credentials: str) -> dict[str, object]:

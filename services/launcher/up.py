@@ -27,6 +27,7 @@ from shared import run_record, settings
 from shared.config import BusConfig, Config
 from shared.errors import ConfigError
 from shared.numerics import settle_all
+from shared.service import setup_logging
 
 log = logging.getLogger(__name__)
 
@@ -68,7 +69,7 @@ def run_all(
         config = config.model_copy(update={"bus": bus})
         credentials = Path(bus.credentials).absolute() if bus.credentials else ""
         (folder / "endpoint").write_text(f"{endpoint}\n{credentials}\n")
-        _log_to(folder / "logs")
+        setup_logging("up", folder, screen=False)  # the terminal belongs to the display
         specs = child_specs(config, stored, folder, own)
         environment = {k: v for k, v in os.environ.items() if not k.startswith(settings.ENV_PREFIX)}
         supervisor = Supervisor(specs, folder / "logs", environment, [lock])
@@ -136,7 +137,8 @@ def child_specs(config: Config, stored: Config, folder: Path, own: str | None) -
         credentials = config.bus.credentials
         # That it may listen there has been decided before.
         secure = ("--credentials", credentials) if credentials else ("--insecure",)
-        specs.append(_spec(ROUTER, "--listen", own, *secure))
+        shared = f"--set=bus.shared_memory={str(config.bus.shared_memory).lower()}"
+        specs.append(_spec(ROUTER, "--listen", own, shared, *secure))
     # What may differ from the stored configuration, such as the endpoint, goes along.
     changes = settings.differences(stored, config)
     options = [f"--set={key}={settings.toml_value(value)}" for key, _, value in changes]
@@ -185,10 +187,3 @@ def stop_on_signals() -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _log_to(folder: Path) -> None:
-    """Log to a file only: the terminal belongs to the display."""
-    folder.mkdir(exist_ok=True)
-    form = "%(asctime)s up %(levelname)s %(message)s"
-    logging.basicConfig(filename=folder / "up.log", level=logging.INFO, format=form, force=True)

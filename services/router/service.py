@@ -26,6 +26,7 @@ def run(
     credentials: str = "",
     *,
     insecure: bool = False,
+    shared_memory: bool = False,
 ) -> None:
     """Route until SIGTERM or SIGINT.
 
@@ -34,6 +35,7 @@ def run(
         announce: called once with the locator that clients connect to.
         credentials: folder of the router, with its configuration; empty: open to everybody.
         insecure: whether it may then be reached from other machines.
+        shared_memory: whether clients may use it.
 
     Raises:
         ConfigError: it cannot or must not listen there.
@@ -47,7 +49,7 @@ def run(
 
     signal.signal(signal.SIGTERM, on_signal)
     signal.signal(signal.SIGINT, on_signal)
-    with open_router(endpoint, file) as locator:
+    with open_router(endpoint, file, shared_memory=shared_memory) as locator:
         log.info("router listens on %s", locator)
         announce(locator)
         while not stop.wait(TICK_S):
