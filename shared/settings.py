@@ -27,9 +27,7 @@ from shared.statefile import create, write_atomically
 
 ENV_PREFIX = "CORRIDOR_"
 FILE_NAME = "config.toml"
-EVERY_START = {
-    *(FILE_NAME, "run.json", "numerics", "lock", "endpoint", "logs", "roles", "halts", "replay"),
-}
+EVERY_START = {FILE_NAME, "run.json", "numerics", "lock", "endpoint", "logs", "roles", "halts"}
 SHORT = {"credentials": "bus.credentials"}
 """Variables of the environment without a section: CORRIDOR_CREDENTIALS."""
 Tree = dict[str, Any]
@@ -185,10 +183,14 @@ def claim(folder: Path, config: Config) -> Config:
 
 def _unused(folder: Path) -> bool:
     """Whether nothing of a run lies in its folder but what every start writes, if it is not up."""
-    memory = folder / "replay" / "data.mdb"
-    names = {path.name for path in folder.iterdir()}
-    nothing = names <= EVERY_START and not (memory.exists() and memory.stat().st_size)
-    return nothing and not is_up(folder)
+
+    def empty(path: Path) -> bool:
+        if path.suffix == ".csv":
+            return path.read_bytes().count(b"\n") < 2
+        known = path.relative_to(folder).parts[0] in EVERY_START
+        return known or (path.suffix == ".mdb" and path.stat().st_size <= 8192)
+
+    return not is_up(folder) and all(empty(path) for path in folder.rglob("*") if path.is_file())
 
 
 def read_folder(folder: Path) -> Config:

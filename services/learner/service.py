@@ -183,7 +183,6 @@ class LearnerLoop:
 
     def _keep(self, turn: Turn, fitted: bool) -> None:
         """Write a checkpoint, and now and then bring it to disk. Raises DiskFull."""
-        self._serve()
         place = (turn.episode, self._identity, turn.lineage)
         checkpoint.keep(self._path, self._trainer, *place)
         if fitted or time.monotonic() - self._synced_s >= SYNC_S:

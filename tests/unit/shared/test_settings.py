@@ -191,7 +191,7 @@ def test_claim_refuses_a_folder_of_another_configuration(
     tmp_path: Path, override: str, message: str
 ) -> None:
     settings.claim(tmp_path, settings.load("demo"))
-    (tmp_path / "learner").mkdir()
+    (tmp_path / "training.csv").write_text("episode\n" * 999)
     with pytest.raises(ConfigError) as caught:
         # A difference that would be allowed comes first in the tree and must not be blamed.
         settings.claim(tmp_path, settings.load("demo", overrides=["run.episodes=5", override]))
@@ -207,7 +207,7 @@ def test_a_folder_in_which_nothing_ran_takes_the_corrected_configuration(tmp_pat
     (tmp_path / "run.json").touch()
     for name in ("logs", "numerics", "roles", "replay"):
         (tmp_path / name).mkdir()
-    (tmp_path / "replay" / "data.mdb").touch()  # of no size where it could not be mapped
+    (tmp_path / "replay" / "data.mdb").write_bytes(bytes(8192))  # as if it could not be mapped
     with (tmp_path / "lock").open("w") as stream:
         fcntl.flock(stream, fcntl.LOCK_EX)
         with pytest.raises(ConfigError, match="another configuration"):  # it is starting now
