@@ -27,7 +27,7 @@ from shared.inbox import Inbox
 from shared.keys import CLAIM_PATTERN, Peer, Stream, alive_key, check_sender, ident_in, parse_alive
 from shared.messages import Message, Refusal
 from shared.pacing import LONGEST_S, paced
-from shared.zenoh_settings import encrypted, open_client, zenoh_config
+from shared.zenoh_settings import encrypted, locator, opened, zenoh_config
 
 M = TypeVar("M", bound=Message)
 REPLY_LIMIT = 16 * 1024 * 1024
@@ -78,8 +78,14 @@ class Bus:
         self._declared: list[Any] = []
         self._publishers: dict[str, zenoh.Publisher] = {}
         try:
-            self._session = open_client(
-                config.endpoint, config.lease_ms, config.credentials, config.shared_memory
+            self._session = opened(
+                zenoh_config(
+                    "client",
+                    connect=[config.endpoint],
+                    lease_ms=config.lease_ms,
+                    shared_memory=config.shared_memory,
+                    credentials=config.credentials,
+                )
             )
         except zenoh.ZError as error:
             takes = f" that takes the credentials in {config.credentials}"
@@ -333,7 +339,7 @@ def open_router(
         else:
             config = zenoh.Config.from_json5(file.read_text())
             config.insert_json5("listen/endpoints", json.dumps([encrypted(endpoint)]))
-        session = zenoh.open(config)
+        session = opened(config)
     except zenoh.ZError as error:
         reason = re.sub(r" at \S+\.rs:\d+\.?", "", str(error))
         raise ConfigError(f"router: cannot listen on {endpoint!r}: {reason}") from error
@@ -341,10 +347,3 @@ def open_router(
         yield locator(session, endpoint)
     finally:
         session.close()  # type: ignore[no-untyped-call]
-
-
-def locator(session: zenoh.Session, endpoint: str) -> str:
-    """Where a session in router mode really listens: `endpoint` with its port filled in."""
-    replies = session.get(f"@/{session.zid()}/router", timeout=5.0)
-    answers = [json.loads(reply.ok.payload.to_string()) for reply in replies if reply.ok]
-    return str(answers[0]["locators"][0]) if answers and answers[0]["locators"] else endpoint

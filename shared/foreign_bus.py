@@ -18,9 +18,8 @@ from typing import Any, Literal
 
 import zenoh
 
-from shared.bus import locator
 from shared.errors import ConfigError, RouterMissing
-from shared.zenoh_settings import zenoh_config
+from shared.zenoh_settings import locator, zenoh_config
 
 MAX_TOKENS = 4096
 """Liveliness tokens an inbox remembers; more are refused and counted."""

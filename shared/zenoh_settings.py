@@ -49,25 +49,23 @@ def zenoh_config(
     return config
 
 
-def open_client(
-    endpoint: str, lease_ms: int, credentials: str, shared_memory: bool
-) -> zenoh.Session:
-    """A session with a router; without shared memory where there is no room. Raises ZError."""
+def opened(config: zenoh.Config) -> zenoh.Session:
+    """A session; without shared memory where there is no room for it. Raises ZError."""
     try:
-        return zenoh.open(
-            zenoh_config(
-                "client",
-                connect=[endpoint],
-                lease_ms=lease_ms,
-                shared_memory=shared_memory,
-                credentials=credentials,
-            )
-        )
+        return zenoh.open(config)
     except BaseException as error:  # a panic of Zenoh is no Exception
-        if not shared_memory or "shm" not in str(error).lower():
+        if "shm" not in str(error).lower():
             raise
         log.warning("messages go without shared memory: %s", error)
-        return open_client(endpoint, lease_ms, credentials, shared_memory=False)
+        config.insert_json5("transport/shared_memory/enabled", "false")
+        return zenoh.open(config)
+
+
+def locator(session: zenoh.Session, endpoint: str) -> str:
+    """Where a session in router mode really listens: `endpoint` with its port filled in."""
+    replies = session.get(f"@/{session.zid()}/router", timeout=5.0)
+    answers = [json.loads(reply.ok.payload.to_string()) for reply in replies if reply.ok]
+    return str(answers[0]["locators"][0]) if answers and answers[0]["locators"] else endpoint
 
 
 def _tls(credentials: str) -> dict[str, object]:
