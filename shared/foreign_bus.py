@@ -9,7 +9,6 @@ what is not taken is counted.
 from __future__ import annotations
 
 import re
-import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
@@ -19,6 +18,7 @@ from typing import Any, Literal
 import zenoh
 
 from shared.errors import ConfigError, RouterMissing
+from shared.inbox import Arrivals
 from shared.zenoh_settings import locator, zenoh_config
 
 MAX_TOKENS = 4096
@@ -58,13 +58,11 @@ class Question:
         self._query.drop()  # type: ignore[no-untyped-call]
 
 
-class RawInbox:
+class RawInbox(Arrivals):
     """Where raw samples, questions and liveliness for one thread arrive."""
 
     def __init__(self) -> None:
-        self._ready = threading.Condition()
-        self._arrivals = 0
-        self._seen = 0
+        super().__init__()
         self._samples: dict[str, deque[RawSample]] = {}
         self._questions: deque[Question] = deque()
         self._tokens: set[str] = set()
@@ -72,18 +70,6 @@ class RawInbox:
         """Changes of the set of tokens so far."""
         self.refused: Counter[str] = Counter()
         """What was not taken, by name of the place: too large, or the place was full."""
-
-    def wait(self, timeout_s: float) -> bool:
-        """Wait until something arrives that was not waited for before; False at the timeout."""
-        with self._ready:
-            arrived = self._ready.wait_for(lambda: self._arrivals > self._seen, timeout_s)
-            self._seen = self._arrivals
-            return arrived
-
-    def wake(self) -> None:
-        """Let the owner's `wait` return (any thread)."""
-        with self._ready:
-            self._arrive()
 
     def take(self, name: str) -> RawSample | None:
         """The oldest sample kept in a place and not taken yet."""
@@ -155,10 +141,6 @@ class RawInbox:
                 self.refused["tokens"] += 1
             self.changes += 1
             self._arrive()
-
-    def _arrive(self) -> None:
-        self._arrivals += 1
-        self._ready.notify_all()
 
 
 class RawPublisher:

@@ -68,10 +68,8 @@ def settle(config: Config, folder: Path, role: Role, common: Path | None = None)
 def settle_all(config: Config, folder: Path, roles: Sequence[Role] = ROLES) -> None:
     """Settle roles now, while nothing else runs that could disturb the measurement.
 
-    In a process of its own: who calls this needs no torch afterwards, and an accelerator that
-    raises, hangs or dies takes only that process with it. It is named and left out.
-
-    Raises ConfigError when the plain way does not work either.
+    In a process of its own: who calls this needs no torch afterwards. An accelerator that raises,
+    hangs or dies there is named and left out. Raises ConfigError when nothing works.
     """
     left_out: tuple[str, ...] = ()
     while left := [
@@ -154,10 +152,7 @@ def _candidates(placed: Numerics) -> list[Numerics]:
 
 
 def _may_try(name: str) -> bool:
-    """Whether this may be tried: nothing of it has failed alone, nor all of it together.
-
-    A child that settles roles says so first: it may not come to say more.
-    """
+    """Whether no part of this has failed; a child says first what it tries: it may be its last."""
     if _left_out is None:
         return True
     os.write(1, f"{TRYING}{name}\n".encode())

@@ -18,13 +18,7 @@ def jittered(wait_s: float) -> float:
 
 
 def paced(items: Iterable[T], patience_s: float, give_up: Callable[[], None]) -> Iterator[T]:
-    """Yield items as they come.
-
-    Args:
-        items: What comes, at any pace.
-        patience_s: Longest time without an item.
-        give_up: Is called when none came for so long, by a thread of its own; it ends `items`.
-    """
+    """Yield items as they come. If none came for so long, a thread calls what ends `items`."""
     moved, ended = threading.Event(), False
 
     def watch() -> None:

@@ -32,14 +32,9 @@ class Mirror:
     ) -> None:
         """Bring the mirror to change `number` (beyond it only after a gap: then by snapshot).
 
-        Args:
-            bus: To replay.
-            number: The change.
-            lineage: Of the memory as of that change.
-            progress: Called again and again; what it raises ends the transfer.
-
-        Raises:
-            BusError: The mirror then stands at a complete change, or starts anew.
+        lineage: of the memory as of that change. progress: is called for each part; what it raises
+        ends the transfer. Raises BusError; the mirror then stands at a complete change, or starts
+        anew.
         """
         if self.number is not None and self.number >= number:
             return
