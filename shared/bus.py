@@ -121,13 +121,9 @@ class Bus:
     ) -> None:
         """Receive the messages of one sender of a `latest` stream, or of all (`*`).
 
-        Args:
-            stream: The stream.
-            ident: The sender.
-            receive: Takes sender and bytes of a message. The sender is None, and the bytes are
-                empty, where the key is of no sender or the message too large. It runs on Zenoh's
-                own thread, one change of threads nearer to who waits for the message: it must only
-                enqueue.
+        `receive` takes sender and bytes of a message; None and no bytes where the key is of no
+        sender or the message too large. It runs on Zenoh's own thread, one change of threads nearer
+        to who waits for the message: it must only enqueue.
         """
         key = stream.wildcard(self.run) if ident == "*" else stream.key(self.run, ident)
 
@@ -325,13 +321,9 @@ def open_router(
 ) -> Iterator[str]:
     """Be a Zenoh router while the block runs; yields the locator it listens on.
 
-    Args:
-        endpoint: where to listen, such as `tcp/127.0.0.1:7447`; port 0 takes a free one.
-        file: configuration with certificates and allow-lists; None: open to everybody.
-        shared_memory: whether clients may use it, see `bus.shared_memory`.
-
-    Raises:
-        ConfigError: it cannot listen there, for instance because the port is in use.
+    endpoint: such as `tcp/127.0.0.1:7447`; port 0 takes a free one. file: configuration with
+    certificates and allow-lists; None: open to everybody. Raises ConfigError when it cannot listen
+    there, for instance because the port is in use.
     """
     try:
         if file is None:

@@ -169,13 +169,9 @@ Undeclare = Callable[[], None]
 class ForeignBus:
     """One session with a foreign network. Close it: an unclosed session never exits.
 
-    Args:
-        endpoint: Where the router is, or where to listen, such as `tcp/127.0.0.1:7447`.
-        mode: `client`: connect, and again whenever the router comes back; `router`: be one.
-
-    Raises:
-        RouterMissing: As a client: none answers within about a second.
-        ConfigError: As a router: it cannot listen there.
+    As a client it connects to `endpoint`, again whenever the router comes back, and raises
+    RouterMissing when none answers within about a second. As a router it listens there; raises
+    ConfigError when it cannot.
     """
 
     def __init__(self, endpoint: str, mode: Literal["client", "router"] = "client") -> None:

@@ -14,17 +14,14 @@ from shared.run_record import Row, append_csv, read_csv, write_csv
 DENSE = 4096
 """Up to here TensorBoard shows each episode, then every second one, from twice as many on every
 fourth one, and so on: its files stay small."""
+MOST_FILES = 50
 log = logging.getLogger(__name__)
 
 
 class MetricsLog:
-    """One CSV file whose first column is the global episode number, mirrored to TensorBoard.
+    """One CSV file whose first column is the global episode number, and whose last is never empty.
 
     A restarted writer says which rows are certain; everything later is written again.
-
-    Args:
-        path: The file, in the folder of a run.
-        columns: Columns of the table; the last one is never empty.
     """
 
     def __init__(self, path: Path, columns: tuple[str, ...]) -> None:
@@ -53,6 +50,8 @@ class MetricsLog:
     def _show(self, episode: int, row: Row) -> None:
         if self._board is None:
             folder = self._path.parent / "tensorboard" / self._path.stem
+            for old in sorted(folder.glob("events.*"))[:-MOST_FILES]:  # one for each start
+                old.unlink()
             self._board = SummaryWriter(str(folder), flush_secs=10)
         for column, value in row.items():
             if column != "episode" and not isinstance(value, str):

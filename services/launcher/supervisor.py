@@ -85,11 +85,8 @@ class Supervisor:
     ) -> None:
         """Prepare; nothing is started yet.
 
-        Args:
-            specs: what to run.
-            logs: existing folder for the output of each child, `<name>.out`.
-            environment: of all children.
-            pass_descriptors: files that stay open in the children.
+        logs: existing folder for the output of each child, `<name>.out`. pass_descriptors: files
+        that stay open in the children.
         """
         self._children = [_Child(spec, logs / f"{spec.name}.out") for spec in specs]
         self._environment, self._descriptors = dict(environment), tuple(pass_descriptors)

@@ -43,15 +43,9 @@ def run_all(
 ) -> int:
     """Run everything until Ctrl-C, SIGTERM, the wanted number of episodes or a final error.
 
-    Args:
-        config: the resolved configuration.
-        folder: run folder.
-        listen: where the own router listens; None: on loopback, on a free port.
-        given: the endpoint was chosen on purpose, so the router there is used.
-        insecure: the own router may listen beyond loopback without credentials.
-
-    Returns the exit code. Raises ConfigError: the folder belongs to another configuration or is in
-    use, or the router must not listen there.
+    listen: where the own router listens; None: on loopback, on a free port. given: the endpoint was
+    chosen on purpose, so the router there is used. Returns the exit code. Raises ConfigError: the
+    folder belongs to another configuration or is in use, or the router must not listen there.
     """
     folder = folder.absolute()
     given = given or config.bus.endpoint != BusConfig().endpoint

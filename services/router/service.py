@@ -28,17 +28,10 @@ def run(
     insecure: bool = False,
     shared_memory: bool = False,
 ) -> None:
-    """Route until SIGTERM or SIGINT.
+    """Route until SIGTERM or SIGINT. Raises ConfigError when it cannot or must not listen there.
 
-    Args:
-        endpoint: where to listen; port 0 takes a free one.
-        announce: called once with the locator that clients connect to.
-        credentials: folder of the router, with its configuration; empty: open to everybody.
-        insecure: whether it may then be reached from other machines.
-        shared_memory: whether clients may use it.
-
-    Raises:
-        ConfigError: it cannot or must not listen there.
+    announce: called once with the locator that clients connect to. credentials: folder of the
+    router, with its configuration; empty: open to everybody, with `insecure` from anywhere.
     """
     refuse_open_door(endpoint, credentials, insecure)
     file = Path(credentials) / "router.json5" if credentials else None
