@@ -133,10 +133,6 @@ class Tables:
                     f"found {list(known)}: choose another run folder"
                 )
 
-    def close(self) -> None:
-        """Close the files; all other threads must be done with them."""
-        self.env.close()
-
     @contextmanager
     def writing(self) -> Iterator[Txn]:
         """A write transaction, on disk at its end. Raises DiskFull: then all is as before."""

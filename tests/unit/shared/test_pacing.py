@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import threading
+from contextlib import suppress
 
 import pytest
 
+from benchmarks.waiting import wait_until
+from shared.bus import Bus
+from shared.config import BusConfig
+from shared.errors import PeerMissing
+from shared.keys import SNAPSHOT
+from shared.messages import NO_LINEAGE, FeedEnd, SnapshotRequest
 from shared.pacing import jittered, paced
 from shared.stopping import StopFlag, Stopped, failing_together
 
@@ -75,3 +82,29 @@ def test_a_thread_that_was_told_to_stop_is_no_failure() -> None:
         thread.start()
         thread.join()
     assert not stop.is_set()
+
+
+def test_a_peer_that_stops_in_the_middle_is_not_waited_for(router: str, run_name: str) -> None:
+    end = FeedEnd(change=1, rows=0, messages=0, lineage=NO_LINEAGE)
+    config = BusConfig(endpoint=router)
+    with Bus(config, run_name) as replay, Bus(config, run_name) as learner:
+        inbox = replay.inbox()
+        inbox.serve(SNAPSHOT)
+        received: list[FeedEnd] = []
+
+        def ask() -> None:
+            while not received:
+                with suppress(PeerMissing):  # the router does not know of it yet
+                    given = learner.request_many(
+                        SNAPSHOT, SnapshotRequest(), FeedEnd, patience_s=0.3
+                    )
+                    received.extend(given)
+
+        asking = threading.Thread(target=ask)
+        asking.start()
+        (request,) = wait_until(lambda: list(inbox.requests()), 20, "a request")
+        with request:
+            request.reply(end)
+            asking.join(20)  # without an error: the caller sees that something is missing
+            assert received == [end]
+            request.reply(end)  # and whoever goes on sending is not disturbed
