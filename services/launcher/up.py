@@ -28,6 +28,7 @@ from shared.config import BusConfig, Config
 from shared.errors import ConfigError
 from shared.numerics import settle_all
 from shared.service import setup_logging
+from shared.statefile import write_atomically
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +63,7 @@ def run_all(
         bus = config.bus.model_copy(update={"endpoint": endpoint})
         config = config.model_copy(update={"bus": bus})
         credentials = Path(bus.credentials).absolute() if bus.credentials else ""
-        (folder / "endpoint").write_text(f"{endpoint}\n{credentials}\n")
+        write_atomically(folder / "endpoint", f"{endpoint}\n{credentials}\n".encode())
         setup_logging("up", folder, screen=False)  # the terminal belongs to the display
         specs = child_specs(config, stored, folder, own)
         environment = {k: v for k, v in os.environ.items() if not k.startswith(settings.ENV_PREFIX)}
