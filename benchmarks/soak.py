@@ -4,6 +4,7 @@ After each start so many steps are driven in lockstep. Measured are every proces
 locked memory, open files) at its end, the standing router, /dev/shm and the run's folder when the
 services are gone. What it has found lies in the folder, and the next call goes on from there. The
 growth is that of the medians of the last tenth of the starts against the tenth after the warm-up.
+That of the folder is told and not judged, because each episode leaves its row and its record.
 
     python -m benchmarks.soak --folder DIR [--starts 200] [--steps 500000] [--check]
 """
@@ -141,7 +142,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     grown = {what: growth_percent(looks, what) for what in looks[-1]}
     rows = [[what, looks[0][what], looks[-1][what], grown[what]] for what in grown]
     print(table(["what", "first", "last", "growth %"], rows))
-    worst = max(grown, key=grown.__getitem__)
+    judged = [what for what in grown if not what.startswith("folder")]
+    worst = max(judged, key=grown.__getitem__)
     print(f"largest growth: {worst}, {grown[worst]:.1f} % (bar: {MOST_PERCENT} %)")
     if grown[worst] > MOST_PERCENT and not given.check:
         raise SystemExit(1)
