@@ -32,7 +32,7 @@ from shared.statefile import create
 Role = Literal["actor", "replay", "learner"]
 ROLES: tuple[Role, ...] = get_args(Role)
 COMMAND = (sys.executable, "-P", "-m", "shared.numerics")
-TRYING, TRY_S = "trying ", 120.0
+TRYING, TRY_S = "trying ", 180.0
 """How a child names what it tries, and how long one try may take."""
 WARM_UP, ROUNDS = 2, 5
 WORTHWHILE = 0.8
