@@ -3,7 +3,7 @@
 #   docker build --target actor --tag corridor-actor .
 #
 # Targets: router; driver-sim (simulated robot), driver-robotino and driver-ros2 (real robots, without
-# simulator); actor, replay, learner. Drivers have no torch. docker-compose.yml builds all of them.
+# simulator), also under the names of presets; actor, replay, learner. Drivers have no torch. docker-compose.yml builds all of them.
 #
 # BASE_IMAGE needs Python 3.11 with venv (deploy/make-base-image.sh makes one from Debian packages).
 # TORCH_INDEX_URL: one of PyTorch's own package indexes, to choose a CPU-only build (much smaller
@@ -32,6 +32,7 @@ COPY shared shared
 COPY services services
 COPY experiments experiments
 RUN pip install --no-deps --ignore-installed --prefix /code .
+COPY deploy/healthy /code/bin/healthy
 
 # ------------------------------------------------ images: an unprivileged user, state below /data
 
@@ -48,7 +49,7 @@ USER corridor
 WORKDIR /data
 ENTRYPOINT ["corridor"]
 HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
-    CMD ["python", "-P", "-m", "services.monitor.health", "router"]
+    CMD ["healthy", "router"]
 CMD ["router", "--listen", "tcp/0.0.0.0:7447"]
 
 FROM base AS driver-sim
@@ -59,7 +60,7 @@ USER corridor
 WORKDIR /data
 ENTRYPOINT ["corridor"]
 HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
-    CMD ["python", "-P", "-m", "services.monitor.health", "driver"]
+    CMD ["healthy", "driver"]
 CMD ["driver"]
 
 FROM base AS driver-robotino
@@ -70,7 +71,7 @@ USER corridor
 WORKDIR /data
 ENTRYPOINT ["corridor"]
 HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
-    CMD ["python", "-P", "-m", "services.monitor.health", "driver"]
+    CMD ["healthy", "driver"]
 CMD ["driver"]
 
 FROM base AS driver-ros2
@@ -81,7 +82,7 @@ USER corridor
 WORKDIR /data
 ENTRYPOINT ["corridor"]
 HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
-    CMD ["python", "-P", "-m", "services.monitor.health", "driver"]
+    CMD ["healthy", "driver"]
 CMD ["driver"]
 
 FROM base AS torch
@@ -100,7 +101,7 @@ USER corridor
 WORKDIR /data
 ENTRYPOINT ["corridor"]
 HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
-    CMD ["python", "-P", "-m", "services.monitor.health", "actor"]
+    CMD ["healthy", "actor"]
 CMD ["actor"]
 
 FROM torch AS replay
@@ -111,7 +112,7 @@ USER corridor
 WORKDIR /data
 ENTRYPOINT ["corridor"]
 HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
-    CMD ["python", "-P", "-m", "services.monitor.health", "replay"]
+    CMD ["healthy", "replay"]
 CMD ["replay"]
 
 FROM torch AS learner
@@ -122,5 +123,12 @@ USER corridor
 WORKDIR /data
 ENTRYPOINT ["corridor"]
 HEALTHCHECK --interval=30s --timeout=15s --start-period=30s --retries=3 \
-    CMD ["python", "-P", "-m", "services.monitor.health", "learner"]
+    CMD ["healthy", "learner"]
 CMD ["learner"]
+
+# ------------------------------------------------ the driver for each preset: one name chooses both
+
+FROM driver-sim AS driver-demo
+FROM driver-sim AS driver-real-corridor
+FROM driver-ros2 AS driver-robotino-ros2
+FROM driver-ros2 AS driver-turtlebot4

@@ -105,14 +105,14 @@ def another_driver(specs: list[ChildSpec], robot: str) -> ChildSpec:
     return ChildSpec(f"driver-{robot}", command, driver.stage)
 
 
-def bus(config: Config, *, shared_memory: bool = True) -> Bus:
+def bus(config: Config, *, shared_memory: bool = False) -> Bus:
     """A client, as soon as the router answers and replay serves."""
     chosen = config.bus.model_copy(update={"shared_memory": shared_memory})
     deadline_s = time.monotonic() + PATIENCE_S
     while True:
         try:
             client = Bus(chosen, config.run.name)
-            client.request(PROGRESS, ProgressRequest(robot="bench"), RobotProgress)
+            client.request(PROGRESS, ProgressRequest(robot="bench"), RobotProgress, ident="bench")
             return client
         except BusError as error:
             if not isinstance(error, RouterMissing):

@@ -232,7 +232,7 @@ def without_passes(mode: Mode) -> list[Bar]:
     config = Config.model_validate(
         {
             "run": {"name": "bench"},
-            "bus": {"endpoint": free_endpoint()},
+            "bus": {"endpoint": free_endpoint(), "shared_memory": True},
             "memory": {"capacity": capacity, "strategy": "normm", "equalise_every": 0},
             "network": {"filters": filters},
         }
@@ -246,15 +246,15 @@ def without_passes(mode: Mode) -> list[Bar]:
         first = fill(folder, config)
         with (
             system(config, folder, SERVED),
-            bus(config) as on,
-            bus(config, shared_memory=False) as off,
+            bus(config, shared_memory=True) as on,
+            bus(config) as off,
         ):
             rates: dict[bool, list[float]] = {True: [], False: []}
             for _ in range(rounds):
                 rates[False].append(snapshot_rate(off))
                 rates[True].append(snapshot_rate(on))
-            spent = acknowledged(on, first, acks)
-            delays = ready(on, config, rounds_of(mode, 20, 50))
+            spent = acknowledged(off, first, acks)
+            delays = ready(off, config, rounds_of(mode, 20, 50))
     return [
         _rate("P7a", rates[False], 250, 400),
         _rate("P7b", rates[True], 700, 1200),

@@ -26,7 +26,8 @@ from shared.errors import (
 from shared.inbox import Inbox
 from shared.keys import CLAIM_PATTERN, Peer, Stream, alive_key, check_sender, ident_in, parse_alive
 from shared.messages import Message, Refusal
-from shared.zenoh_settings import encrypted, zenoh_config
+from shared.pacing import LONGEST_S, paced
+from shared.zenoh_settings import encrypted, locator, opened, zenoh_config
 
 M = TypeVar("M", bound=Message)
 REPLY_LIMIT = 16 * 1024 * 1024
@@ -77,7 +78,7 @@ class Bus:
         self._declared: list[Any] = []
         self._publishers: dict[str, zenoh.Publisher] = {}
         try:
-            self._session = zenoh.open(
+            self._session = opened(
                 zenoh_config(
                     "client",
                     connect=[config.endpoint],
@@ -120,13 +121,9 @@ class Bus:
     ) -> None:
         """Receive the messages of one sender of a `latest` stream, or of all (`*`).
 
-        Args:
-            stream: The stream.
-            ident: The sender.
-            receive: Takes sender and bytes of a message. The sender is None, and the bytes are
-                empty, where the key is of no sender or the message too large. It runs on Zenoh's
-                own thread, one change of threads nearer to who waits for the message: it must only
-                enqueue.
+        `receive` takes sender and bytes of a message; None and no bytes where the key is of no
+        sender or the message too large. It runs on Zenoh's own thread, one change of threads nearer
+        to who waits for the message: it must only enqueue.
         """
         key = stream.wildcard(self.run) if ident == "*" else stream.key(self.run, ident)
 
@@ -191,34 +188,37 @@ class Bus:
         *types: type[M],
         ident: str = "main",
         timeout_s: float | None = None,
+        patience_s: float = 0.0,
         everybody: bool = False,
     ) -> Iterator[M]:
         """Ask once and yield the answers as they come. Raises like `request`.
 
         Zenoh ends a broken transfer without an error: the caller checks that it is complete. With
-        `everybody` it asks all who serve the stream, and errors of some do not matter.
+        `patience_s` each answer has so long to come, in place of all together. With `everybody` it
+        asks all who serve the stream, and errors of some do not matter.
         """
-        key = stream.key(self.run, ident)
+        key, token = stream.key(self.run, ident), zenoh.CancellationToken()
+        limit_s = LONGEST_S if patience_s else timeout_s or self.config.request_timeout_s
         replies = self._session.get(
             key,
             FifoChannel(64),
             payload=encode(message),
             consolidation=zenoh.ConsolidationMode.NONE,
             congestion_control=zenoh.CongestionControl.BLOCK,
-            timeout=timeout_s or self.config.request_timeout_s,
+            timeout=limit_s,
+            cancellation_token=token,
             target=zenoh.QueryTarget.ALL if everybody else zenoh.QueryTarget.BEST_MATCHING,
         )
         answered = False
-        for reply in replies:
-            if reply.ok is None and everybody:
-                continue
-            answered = True
-            if reply.ok is None:
-                raise _failure(key, reply)
-            payload = reply.ok.payload
-            if len(payload) > REPLY_LIMIT:
-                raise BadMessage(f"{key}: reply of {len(payload)} bytes, at most {REPLY_LIMIT}")
-            yield decode(payload.to_bytes(), *types)
+        try:
+            for reply in paced(replies, patience_s, token.cancel) if patience_s else replies:
+                if reply.ok is None and everybody:
+                    continue
+                answered = True
+                yield decode(_payload(key, reply), *types)
+        finally:
+            del replies  # or its full queue would hold up the cancelling
+            token.cancel()  # type: ignore[no-untyped-call]
         if not answered:
             raise PeerMissing(f"{key}: nobody answers")
 
@@ -295,9 +295,17 @@ class Bus:
         return {str(reply.ok.key_expr).split("/")[-1] for reply in replies if reply.ok}
 
 
-def _failure(key: str, reply: zenoh.Reply) -> BusError:
+def _payload(key: str, reply: zenoh.Reply) -> bytes:
+    """The bytes of an answer. Raises BusError for an error, BadMessage for one too large."""
+    if reply.ok is None:
+        raise _failure(key, reply.err.payload.to_bytes() if reply.err else b"")
+    if len(reply.ok.payload) > REPLY_LIMIT:
+        raise BadMessage(f"{key}: reply of {len(reply.ok.payload)} bytes, at most {REPLY_LIMIT}")
+    return reply.ok.payload.to_bytes()
+
+
+def _failure(key: str, payload: bytes) -> BusError:
     """What an error reply means."""
-    payload = reply.err.payload.to_bytes() if reply.err else b""
     if payload == b"Timeout":
         return PeerSilent(f"{key}: no answer in time")
     try:
@@ -308,23 +316,22 @@ def _failure(key: str, reply: zenoh.Reply) -> BusError:
 
 
 @contextmanager
-def open_router(endpoint: str, file: Path | None = None) -> Iterator[str]:
+def open_router(
+    endpoint: str, file: Path | None = None, *, shared_memory: bool = False
+) -> Iterator[str]:
     """Be a Zenoh router while the block runs; yields the locator it listens on.
 
-    Args:
-        endpoint: where to listen, such as `tcp/127.0.0.1:7447`; port 0 takes a free one.
-        file: configuration with certificates and allow-lists; None: open to everybody.
-
-    Raises:
-        ConfigError: it cannot listen there, for instance because the port is in use.
+    endpoint: such as `tcp/127.0.0.1:7447`; port 0 takes a free one. file: configuration with
+    certificates and allow-lists; None: open to everybody. Raises ConfigError when it cannot listen
+    there, for instance because the port is in use.
     """
     try:
         if file is None:
-            config = zenoh_config("router", listen=[endpoint])
+            config = zenoh_config("router", listen=[endpoint], shared_memory=shared_memory)
         else:
             config = zenoh.Config.from_json5(file.read_text())
             config.insert_json5("listen/endpoints", json.dumps([encrypted(endpoint)]))
-        session = zenoh.open(config)
+        session = opened(config)
     except zenoh.ZError as error:
         reason = re.sub(r" at \S+\.rs:\d+\.?", "", str(error))
         raise ConfigError(f"router: cannot listen on {endpoint!r}: {reason}") from error
@@ -332,10 +339,3 @@ def open_router(endpoint: str, file: Path | None = None) -> Iterator[str]:
         yield locator(session, endpoint)
     finally:
         session.close()  # type: ignore[no-untyped-call]
-
-
-def locator(session: zenoh.Session, endpoint: str) -> str:
-    """Where a session in router mode really listens: `endpoint` with its port filled in."""
-    replies = session.get(f"@/{session.zid()}/router", timeout=5.0)
-    answers = [json.loads(reply.ok.payload.to_string()) for reply in replies if reply.ok]
-    return str(answers[0]["locators"][0]) if answers and answers[0]["locators"] else endpoint

@@ -3,6 +3,7 @@
 CorridorError
 ├── ConfigError        wrong configuration or folder: exit code 2, one line, nothing moved yet
 ├── StateError         what lies on disk does not fit or is damaged: exit code 3
+├── DiskFull           no room for a file: what waits for it goes on as soon as there is
 ├── RoleTaken          another process has this role: exit code 4, one line
 ├── RobotMissing       no real robot answers (yet): exit code 1, one line
 ├── BadMessage         bytes that are not a valid message of the expected type
@@ -36,6 +37,10 @@ class ConfigError(CorridorError):
 
 class StateError(CorridorError):
     """State on disk that does not belong to this run or is damaged."""
+
+
+class DiskFull(CorridorError, OSError):
+    """There is no room for a file; whatever was there is as before."""
 
 
 class RoleTaken(CorridorError):

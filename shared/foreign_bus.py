@@ -9,7 +9,6 @@ what is not taken is counted.
 from __future__ import annotations
 
 import re
-import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
@@ -18,9 +17,9 @@ from typing import Any, Literal
 
 import zenoh
 
-from shared.bus import locator
 from shared.errors import ConfigError, RouterMissing
-from shared.zenoh_settings import zenoh_config
+from shared.inbox import Arrivals
+from shared.zenoh_settings import locator, zenoh_config
 
 MAX_TOKENS = 4096
 """Liveliness tokens an inbox remembers; more are refused and counted."""
@@ -59,13 +58,11 @@ class Question:
         self._query.drop()  # type: ignore[no-untyped-call]
 
 
-class RawInbox:
+class RawInbox(Arrivals):
     """Where raw samples, questions and liveliness for one thread arrive."""
 
     def __init__(self) -> None:
-        self._ready = threading.Condition()
-        self._arrivals = 0
-        self._seen = 0
+        super().__init__()
         self._samples: dict[str, deque[RawSample]] = {}
         self._questions: deque[Question] = deque()
         self._tokens: set[str] = set()
@@ -73,18 +70,6 @@ class RawInbox:
         """Changes of the set of tokens so far."""
         self.refused: Counter[str] = Counter()
         """What was not taken, by name of the place: too large, or the place was full."""
-
-    def wait(self, timeout_s: float) -> bool:
-        """Wait until something arrives that was not waited for before; False at the timeout."""
-        with self._ready:
-            arrived = self._ready.wait_for(lambda: self._arrivals > self._seen, timeout_s)
-            self._seen = self._arrivals
-            return arrived
-
-    def wake(self) -> None:
-        """Let the owner's `wait` return (any thread)."""
-        with self._ready:
-            self._arrive()
 
     def take(self, name: str) -> RawSample | None:
         """The oldest sample kept in a place and not taken yet."""
@@ -157,10 +142,6 @@ class RawInbox:
             self.changes += 1
             self._arrive()
 
-    def _arrive(self) -> None:
-        self._arrivals += 1
-        self._ready.notify_all()
-
 
 class RawPublisher:
     """Publishes to one key; never blocks, what the network cannot take at once is lost."""
@@ -188,13 +169,9 @@ Undeclare = Callable[[], None]
 class ForeignBus:
     """One session with a foreign network. Close it: an unclosed session never exits.
 
-    Args:
-        endpoint: Where the router is, or where to listen, such as `tcp/127.0.0.1:7447`.
-        mode: `client`: connect, and again whenever the router comes back; `router`: be one.
-
-    Raises:
-        RouterMissing: As a client: none answers within about a second.
-        ConfigError: As a router: it cannot listen there.
+    As a client it connects to `endpoint`, again whenever the router comes back, and raises
+    RouterMissing when none answers within about a second. As a router it listens there; raises
+    ConfigError when it cannot.
     """
 
     def __init__(self, endpoint: str, mode: Literal["client", "router"] = "client") -> None:
@@ -204,7 +181,6 @@ class ForeignBus:
                 mode,
                 connect=[endpoint] if client else [],
                 listen=[] if client else [endpoint],
-                shared_memory=False,
             )
         except zenoh.ZError as error:
             raise ConfigError(

@@ -30,14 +30,36 @@ MAX_ANSWERS = 256
 """Answers to questions to all that are kept; newer ones replace the oldest."""
 
 
-class Inbox:
+class Arrivals:
+    """Lets one thread wait for what others put in. They hold `_ready` and call `_arrive`."""
+
+    def __init__(self) -> None:
+        self._ready = threading.Condition()
+        self._arrivals = self._seen = 0
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait until something arrives that was not waited for before; False at the timeout."""
+        with self._ready:
+            arrived = self._ready.wait_for(lambda: self._arrivals > self._seen, timeout_s)
+            self._seen = self._arrivals
+            return arrived
+
+    def wake(self) -> None:
+        """Let the owner's `wait` return (for shutdown; any thread)."""
+        with self._ready:
+            self._arrive()
+
+    def _arrive(self) -> None:
+        self._arrivals += 1
+        self._ready.notify_all()
+
+
+class Inbox(Arrivals):
     """Messages that came for one thread. All methods but `wake` belong to that thread."""
 
     def __init__(self, bus: Bus) -> None:
+        super().__init__()
         self._bus = bus
-        self._ready = threading.Condition()
-        self._arrivals = 0
-        self._seen = 0
         self._latest: dict[tuple[str, str], bytes] = {}
         self._queues: dict[str, deque[Request]] = {}
         self.refused: Counter[str] = Counter()
@@ -127,18 +149,6 @@ class Inbox:
         with self._ready:
             return frozenset(self._present.get((service, ident), ()))
 
-    def wait(self, timeout_s: float) -> bool:
-        """Wait until something arrives that was not waited for before; False at the timeout."""
-        with self._ready:
-            arrived = self._ready.wait_for(lambda: self._arrivals > self._seen, timeout_s)
-            self._seen = self._arrivals
-            return arrived
-
-    def wake(self) -> None:
-        """Let the owner's `wait` return (for shutdown; any thread)."""
-        with self._ready:
-            self._arrive()
-
     def take(self, stream: Stream, cls: type[M]) -> list[tuple[str, M]]:
         """The newest unread message of each sender of a `latest` stream, decoded."""
         with self._ready:
@@ -188,7 +198,3 @@ class Inbox:
             count = self.refused[stream.name]
         if count & (count - 1) == 0:  # 1, 2, 4, 8 ...: visible, never a flood
             log.warning("%s: message refused (%d so far): %s", stream.name, count, error)
-
-    def _arrive(self) -> None:
-        self._arrivals += 1
-        self._ready.notify_all()

@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import logging
 import os
+import select
+import signal
 import subprocess
 import sys
 import time
@@ -27,9 +30,16 @@ from shared.settings import read_folder
 from shared.statefile import create
 
 Role = Literal["actor", "replay", "learner"]
+ROLES: tuple[Role, ...] = get_args(Role)
+COMMAND = (sys.executable, "-P", "-m", "shared.numerics")
+TRYING, TRY_S = "trying ", 180.0
+"""How a child names what it tries, and how long one try may take."""
 WARM_UP, ROUNDS = 2, 5
 WORTHWHILE = 0.8
 """What is not plain must take less than this part of the plain way's time to be chosen."""
+log = logging.getLogger(__name__)
+_left_out: list[str] | None = None
+"""In a child that settles roles: what failed in those before it. None: this is no such child."""
 
 
 def settle(config: Config, folder: Path, role: Role, common: Path | None = None) -> Numerics:
@@ -42,7 +52,7 @@ def settle(config: Config, folder: Path, role: Role, common: Path | None = None)
     wanted: Numerics = getattr(config.numerics, role)
     if wanted.settled:
         return _installed(wanted)
-    path = folder / "numerics" / f"{role}.json"
+    path = _path(folder, role)
     if path.exists():
         try:
             return _installed(type(wanted).model_validate(json.loads(path.read_text())))
@@ -55,15 +65,52 @@ def settle(config: Config, folder: Path, role: Role, common: Path | None = None)
     return settle(config, folder, role)  # another process may have been faster
 
 
-def settle_all(config: Config, folder: Path) -> None:
-    """Settle every role now, while nothing else runs that could disturb the measurement.
+def settle_all(config: Config, folder: Path, roles: Sequence[Role] = ROLES) -> None:
+    """Settle roles now, while nothing else runs that could disturb the measurement.
 
-    In a process of its own: who calls this needs no torch afterwards. Raises StateError.
+    In a process of its own: who calls this needs no torch afterwards. An accelerator that raises,
+    hangs or dies there is named and left out. Raises ConfigError when nothing works.
     """
-    roles = [role for role in get_args(Role) if not getattr(config.numerics, role).settled]
-    command = [sys.executable, "-m", "shared.numerics", str(folder), *roles]
-    if roles and subprocess.run(command, check=False).returncode:
-        raise StateError(f"{folder}: numerics could not be settled, see above")
+    left_out: tuple[str, ...] = ()
+    while left := [
+        role
+        for role in roles
+        if not getattr(config.numerics, role).settled and not _path(folder, role).exists()
+    ]:
+        tried, how = _settled_elsewhere(folder, left, left_out)
+        if not how:
+            return
+        if not tried or tried in left_out:
+            raise ConfigError(f"numerics of {', '.join(left)} cannot be settled here: {how}")
+        log.warning("numerics: %s does not work here and is left out: %s", tried, how)
+        left_out = (*left_out, tried)
+
+
+def _settled_elsewhere(
+    folder: Path, roles: Sequence[Role], left_out: Sequence[str]
+) -> tuple[str, str]:
+    """What a child that settles roles tried last, and what it died of; empty if it did not."""
+    command = (*COMMAND, str(folder), json.dumps(left_out), *roles)
+    said = b""
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as child:
+        assert child.stdout is not None
+        while ready := select.select([child.stdout], [], [], TRY_S)[0]:
+            if not (data := os.read(child.stdout.fileno(), 65536)):
+                break
+            said += data
+        if not ready:
+            child.kill()
+    lines = said.decode(errors="replace").splitlines()
+    tried = [line.removeprefix(TRYING) for line in lines if line.startswith(TRYING)]
+    last = next((line for line in reversed(lines) if not line.startswith(TRYING)), "no reason told")
+    how = last if ready else f"it took longer than {TRY_S:.0f} s"
+    if ready and child.returncode < 0:
+        how = signal.Signals(-child.returncode).name
+    return tried[-1] if tried else "", how if child.returncode else ""
+
+
+def _path(folder: Path, role: Role) -> Path:
+    return folder / "numerics" / f"{role}.json"
 
 
 def choose(config: Config, wanted: Numerics, role: Role) -> Numerics:
@@ -76,13 +123,15 @@ def choose(config: Config, wanted: Numerics, role: Role) -> Numerics:
     """
     threads, device = wanted.threads, wanted.device
     if device == "auto":
-        device = "cuda" if _has_gpu() else "cpu"
+        device = "cuda" if _may_try("cuda") and _has_gpu() else "cpu"
     if not threads:
         alone = config.learning.mode == "synchronous" and role != "actor"
         threads = min(len(os.sched_getaffinity(0)), 8) if alone and device == "cpu" else 1
     placed = _installed(wanted.model_copy(update={"threads": threads, "device": device}))
-    candidates = _candidates(placed)
-    if len(candidates) == 1:
+    candidates = [each for each in _candidates(placed) if _may_try(_name(each))]
+    if not candidates:
+        raise ConfigError(f"numerics.{role}: {_name(placed)} does not work here")
+    if len(candidates) == 1 and device == "cpu":
         return candidates[0]
     times = _seconds(config, candidates, role)
     return _fastest(candidates, times)
@@ -100,6 +149,20 @@ def _candidates(placed: Numerics) -> list[Numerics]:
         for precision in precisions
         for engine in engines
     ]
+
+
+def _may_try(name: str) -> bool:
+    """Whether no part of this has failed; a child says first what it tries: it may be its last."""
+    if _left_out is None:
+        return True
+    os.write(1, f"{TRYING}{name}\n".encode())
+    return not any(set(failed.split()) <= set(name.split()) for failed in _left_out)
+
+
+def _name(numerics: Numerics) -> str:
+    """What makes it other than the plain way."""
+    words = (numerics.device, numerics.engine, numerics.precision)
+    return " ".join(w for w in words if w not in ("cpu", "torch", "float32", "auto")) or "plain"
 
 
 def _fastest(candidates: Sequence[Numerics], times: Sequence[float]) -> Numerics:
@@ -130,10 +193,14 @@ def _has_openvino() -> bool:
 
 def _seconds(config: Config, candidates: Sequence[Numerics], role: Role) -> list[float]:
     """Time of the role's work under each candidate, medians of interleaved rounds."""
-    work = [(_training if role == "learner" else _predicting)(config, each) for each in candidates]
+    work = []
+    for each in candidates:
+        _may_try(_name(each))
+        work.append((_training if role == "learner" else _predicting)(config, each))
     times: list[list[float]] = [[] for _ in work]
     for number in range(WARM_UP + ROUNDS):
-        for do, spent in zip(work, times, strict=True):
+        for each, do, spent in zip(candidates, work, times, strict=True):
+            _may_try(_name(each))
             start_s = time.perf_counter()
             do()
             if number >= WARM_UP:
@@ -166,10 +233,11 @@ def _training(config: Config, numerics: Numerics) -> Callable[[], object]:
     return lambda: trainer.step(samples, np.arange(size))
 
 
-def main(folder: str, *roles: str) -> None:
-    """Settle some roles of the run in `folder`."""
-    config = read_folder(Path(folder))
-    for role in get_args(Role):
+def main(folder: str, left_out: str, *roles: str) -> None:
+    """Settle some roles of the run in `folder`, and say on standard output what is tried."""
+    global _left_out
+    config, _left_out = read_folder(Path(folder)), json.loads(left_out)
+    for role in ROLES:
         if role in roles:
             settle(config, Path(folder), role)
 

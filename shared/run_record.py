@@ -12,7 +12,8 @@ replay writes `episodes.csv` without the columns that only the learner knows; th
 from __future__ import annotations
 
 import csv
-import os
+import errno
+import io
 import shlex
 import sys
 import time
@@ -26,7 +27,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from shared.facts import SHORT_NAMES
 from shared.provenance import machine
 from shared.rl.retention.table import TELLS
-from shared.statefile import create
+from shared.statefile import create, needing_room, write_atomically
 
 if TYPE_CHECKING:
     from shared.config import Config
@@ -229,20 +230,26 @@ def samples_by_world(text: str) -> dict[str, int]:
 
 def write_csv(path: Path, columns: tuple[str, ...], rows: Iterable[Row]) -> None:
     """Write a table whole or not at all. Raises ValueError for a row with an unknown column."""
-    temporary = path.with_name(f".{path.name}.new")
-    with temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    os.replace(temporary, path)
+    head = ",".join(columns) + "\n"
+    write_atomically(path, head.encode() + _lines(columns, rows))
 
 
 def append_csv(path: Path, columns: tuple[str, ...], rows: Iterable[Row]) -> None:
-    """Append rows; the header is written first where there is no file yet."""
+    """Append rows, all or none; the header is written first where there is no file yet."""
     if not path.exists():
         write_csv(path, columns, ())
-    with path.open("a", newline="", encoding="utf-8") as file:
-        csv.DictWriter(file, columns, lineterminator="\n").writerows(rows)
+    data = _lines(columns, rows)
+    with needing_room(path), path.open("ab", buffering=0) as file:
+        end = file.tell()
+        if file.write(data) != len(data):
+            file.truncate(end)
+            raise OSError(errno.ENOSPC, "no room for all rows")
+
+
+def _lines(columns: tuple[str, ...], rows: Iterable[Row]) -> bytes:
+    text = io.StringIO()
+    csv.DictWriter(text, columns, lineterminator="\n").writerows(rows)
+    return text.getvalue().encode()
 
 
 def read_csv(path: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:

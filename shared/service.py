@@ -8,11 +8,11 @@ import os
 import secrets
 import signal
 import socket
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from types import FrameType
 from typing import TypeVar
@@ -26,6 +26,7 @@ from shared.errors import (
     BusError,
     ConfigError,
     CorridorError,
+    DiskFull,
     PeerRefused,
     RobotMissing,
     RoleTaken,
@@ -36,6 +37,10 @@ from shared.halts.keeper import HaltKeeper
 from shared.inbox import Inbox
 from shared.keys import PING, STOP
 from shared.messages import PROTOCOL_VERSION, Ping, ServiceReply, StopService
+from shared.pacing import jittered
+from shared.stopping import StopFlag as StopFlag
+from shared.stopping import Stopped as Stopped
+from shared.stopping import failing_together
 
 VERSION = "0.1.0"
 EXIT_OK, EXIT_CRASH, EXIT_CONFIG, EXIT_STATE, EXIT_ROLE = 0, 1, 2, 3, 4
@@ -45,12 +50,9 @@ SETTLE_S = 3.0
 """Two processes that have met in one role compare their ages after this time, and again."""
 TICK_S = 0.2
 """Longest a service waits before it looks at its stop flag."""
+MOST_LOG_BYTES, LOGS_KEPT = 8 * 1024 * 1024, 3
 T = TypeVar("T")
 log = logging.getLogger(__name__)
-
-
-class Stopped(Exception):
-    """The service was asked to stop while it waited: unwinds to its main function."""
 
 
 def new_life() -> str:
@@ -165,7 +167,7 @@ class Service:
         )
 
     def insist(self, what: str, attempt: Callable[[], T], *, refusals: int = 0) -> T:
-        """Repeat a request until it is answered; log when it takes long.
+        """Repeat a request until it is answered, or a write until there is room; log long waits.
 
         refusals: how many refusals for good end it, since one may be a message gone astray or a
             lie; 0: none does, for a request that is always right.
@@ -178,7 +180,7 @@ class Service:
                 raise Stopped(what)
             try:
                 return attempt()
-            except (BusError, BadMessage) as error:
+            except (BusError, BadMessage, DiskFull) as error:
                 if isinstance(error, PeerRefused) and error.final:
                     refusals -= 1
                     if refusals == 0:
@@ -187,36 +189,7 @@ class Service:
                 if waited_s > next_report_s:
                     self.log.warning("still waiting to %s after %.0f s: %s", what, waited_s, error)
                     next_report_s *= 2
-                self.stop.wait(0.05 if waited_s < 2 else TICK_S)
-
-
-class StopFlag:
-    """Set by SIGTERM, SIGINT, a `stop` command or the end of the run; remembers why."""
-
-    def __init__(self) -> None:
-        self._event = threading.Event()
-        self.reason = ""
-        self._wakes: list[Callable[[], None]] = []
-
-    def set(self, reason: str) -> None:
-        """Ask the service to stop."""
-        if not self._event.is_set():
-            self.reason = reason
-            self._event.set()
-            for wake in self._wakes:
-                wake()
-
-    def is_set(self) -> bool:
-        """Whether the service is to stop."""
-        return self._event.is_set()
-
-    def wait(self, timeout_s: float) -> bool:
-        """Sleep for at most `timeout_s`; True as soon as the service is to stop."""
-        return self._event.wait(timeout_s)
-
-    def on_set(self, wake: Callable[[], None]) -> None:
-        """Call `wake` when set (to interrupt a wait)."""
-        self._wakes.append(wake)
+                self.stop.wait(jittered(min(max(waited_s / 4, 0.05), 1.0)))
 
 
 _held: list[int] = []
@@ -281,14 +254,15 @@ def controlled(me: Service) -> Iterator[None]:
     """Answer `ping` and `stop` while the block runs; the stop flag is set at its end."""
     me.serve_role(me.ident)
     me.control.watch(me.name, me.ident)
-    thread = threading.Thread(target=me.serve_control, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        me.stop.set("finished")
-        thread.join(2.0)
-        me.log.info("%s %r stops: %s", me.name, me.ident, me.stop.reason)
+    thread = threading.Thread(target=me.serve_control, name="control", daemon=True)
+    with failing_together(me.stop):
+        thread.start()
+        try:
+            yield
+        finally:
+            me.stop.set("finished")
+            thread.join(2.0)
+            me.log.info("%s %r stops: %s", me.name, me.ident, me.stop.reason)
 
 
 def _connect(name: str, config: Config, stop: StopFlag) -> Bus:
@@ -301,16 +275,17 @@ def _connect(name: str, config: Config, stop: StopFlag) -> Bus:
             if not told:
                 log.warning("%s waits for the router: %s", name, error)
                 told = True
-            stop.wait(TICK_S)
+            stop.wait(jittered(TICK_S))
     raise Stopped("waiting for the router")
 
 
-def setup_logging(name: str, folder: Path | None) -> None:
-    """Log to standard error and, with a folder, to `<folder>/logs/<name>.log`."""
-    handlers: list[logging.Handler] = [logging.StreamHandler(sys.stderr)]
+def setup_logging(name: str, folder: Path | None, *, screen: bool = True) -> None:
+    """Log to `<folder>/logs/<name>.log`, if there is a folder, and to standard error."""
+    handlers: list[logging.Handler] = [logging.StreamHandler()] if screen else []
     if folder is not None:
         (folder / "logs").mkdir(parents=True, exist_ok=True)
-        handlers.append(logging.FileHandler(folder / "logs" / f"{name}.log"))
+        path = folder / "logs" / f"{name}.log"
+        handlers.append(RotatingFileHandler(path, maxBytes=MOST_LOG_BYTES, backupCount=LOGS_KEPT))
     form = f"%(asctime)s {name} %(levelname)s %(message)s"
     logging.basicConfig(level=logging.INFO, format=form, handlers=handlers, force=True)
 
@@ -325,7 +300,7 @@ def guarded(name: str, main: Callable[[], None]) -> int:
         log.error("%s", error)
         codes = {ConfigError: EXIT_CONFIG, StateError: EXIT_STATE, RoleTaken: EXIT_ROLE}
         return codes[type(error)]
-    except RobotMissing as error:
+    except (RobotMissing, DiskFull) as error:
         log.error("%s", error)
         return EXIT_CRASH
     except CorridorError:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import json
 import re
+import shutil
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
@@ -21,10 +22,12 @@ from pydantic.fields import FieldInfo
 
 from shared.config import DRIVER_ONLY, Config, Section
 from shared.errors import ConfigError, StateError
+from shared.place import is_up
 from shared.statefile import create, write_atomically
 
 ENV_PREFIX = "CORRIDOR_"
 FILE_NAME = "config.toml"
+EVERY_START = {FILE_NAME, "run.json", "numerics", "lock", "endpoint", "logs", "roles", "halts"}
 SHORT = {"credentials": "bus.credentials"}
 """Variables of the environment without a section: CORRIDOR_CREDENTIALS."""
 Tree = dict[str, Any]
@@ -160,7 +163,7 @@ def claim(folder: Path, config: Config) -> Config:
 
     The first use creates the folder and its `config.toml`, which then never changes. Only what
     `Config.fingerprint` leaves out (where the router is, how long the run goes on, which robot
-    drives and how it is reached) may differ on later uses.
+    drives and how it is reached) may differ on later uses. As long as nothing ran, all may.
 
     Raises:
         ConfigError: the folder belongs to another configuration, or cannot be made.
@@ -168,12 +171,23 @@ def claim(folder: Path, config: Config) -> Config:
     """
     path = folder / FILE_NAME
     try:
+        str(folder.absolute()).encode()
+    except UnicodeEncodeError:
+        raise ConfigError(f"run folder {str(folder)!a}: expected a name in UTF-8") from None
+    try:
         folder.mkdir(parents=True, exist_ok=True)
         if not path.exists():
             create(path, _resolved(config))
     except OSError as error:
-        raise ConfigError(f"run folder {folder}: cannot be created: {error.strerror}") from error
+        raise ConfigError(
+            f"run folder {folder}: cannot be created: {error.strerror or error}"
+        ) from error
     stored = read_folder(folder)
+    if stored.fingerprint() != config.fingerprint() and _unused(folder):
+        shutil.rmtree(folder / "numerics", ignore_errors=True)
+        (folder / "run.json").unlink(missing_ok=True)
+        write(config, path)
+        return config
     if stored.fingerprint() != config.fingerprint():
         name, old, new = _first_binding_difference(stored, config)
         raise ConfigError(
@@ -181,6 +195,18 @@ def claim(folder: Path, config: Config) -> Config:
             f"there, but {toml_value(new)} now; use another run name (--run) or folder (--run-dir)"
         )
     return stored
+
+
+def _unused(folder: Path) -> bool:
+    """Whether nothing of a run lies in its folder but what every start writes, if it is not up."""
+
+    def empty(path: Path) -> bool:
+        if path.suffix == ".csv":
+            return path.read_bytes().count(b"\n") < 2
+        known = path.relative_to(folder).parts[0] in EVERY_START
+        return known or (path.suffix == ".mdb" and path.stat().st_size <= 8192)
+
+    return not is_up(folder) and all(empty(path) for path in folder.rglob("*") if path.is_file())
 
 
 def read_folder(folder: Path) -> Config:

@@ -2,29 +2,47 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import msgpack
 
-from shared.errors import StateError
+from shared.errors import DiskFull, StateError
 
 LIMIT_BYTES = 64 * 1024 * 1024
 
 
+@contextmanager
+def needing_room(path: Path) -> Iterator[None]:
+    """Raise DiskFull where an error tells that there was no room for this file."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        raise DiskFull(f"disk full: {path}") from error
+
+
 def write_atomically(path: Path, data: bytes) -> None:
     """Write a file so that after a kill or power cut it is either the old or the new one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(path.name + ".new")
-    with beside.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    beside.replace(path)
-    _sync(path.parent)
+    with needing_room(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with beside.open("wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            beside.replace(path)
+        finally:
+            beside.unlink(missing_ok=True)
+        sync(path.parent)
 
 
 def create(path: Path, data: bytes) -> None:
@@ -32,7 +50,7 @@ def create(path: Path, data: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, beside = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:
-        with os.fdopen(handle, "wb") as file:
+        with needing_room(path), os.fdopen(handle, "wb") as file:
             file.write(data)
             file.flush()
             os.fchmod(file.fileno(), 0o644)
@@ -58,7 +76,7 @@ def take(path: Path) -> dict[str, Any] | None:
     state = read(path)
     if state is not None:
         path.unlink()
-        _sync(path.parent)
+        sync(path.parent)
     return state
 
 
@@ -82,7 +100,7 @@ def set_aside(path: Path) -> Path:
         if not (name := path.with_name(f"{path.name}.unreadable-{n}")).exists()
     )
     path.rename(aside)
-    _sync(path.parent)
+    sync(path.parent)
     return aside
 
 
@@ -95,7 +113,7 @@ def _bytes(path: Path) -> bytes | None:
         return None
 
 
-def _sync(folder: Path) -> None:
+def sync(folder: Path) -> None:
     """Bring what was renamed or removed in a folder to disk."""
     directory = os.open(folder, os.O_RDONLY)
     try:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from shared.bus import Bus
 
 PART_BYTES = 1024 * 1024
+PATIENCE_S = 5.0
+"""Longest that a part of a transfer takes to come."""
 RETRY_S = 0.05
 LONGEST_RETRY_S = 10.0
 """Period of asking for a version that is announced but not delivered, or refused."""
@@ -40,7 +42,10 @@ def fetch(bus: Bus, *, everybody: bool = False) -> tuple[int, bytes]:
     everybody: ask all who serve weights, in place of the one that the router chooses.
     """
     received, digest, size = [], WeightsHash(), 0
-    for message in bus.request_many(WEIGHTS, WeightsRequest(), Weights, everybody=everybody):
+    replies = bus.request_many(
+        WEIGHTS, WeightsRequest(), Weights, patience_s=PATIENCE_S, everybody=everybody
+    )
+    for message in replies:
         digest.add(message.data)  # while the next part is on its way
         received.append(message)
         size += len(message.data)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import logging
 import re
 from collections.abc import Sequence
 
 import zenoh
+
+log = logging.getLogger(__name__)
 
 
 def zenoh_config(
@@ -15,7 +18,7 @@ def zenoh_config(
     connect: Sequence[str] = (),
     listen: Sequence[str] = (),
     lease_ms: int = 2000,
-    shared_memory: bool = True,
+    shared_memory: bool = False,
     credentials: str = "",
 ) -> zenoh.Config:
     """A closed configuration: no scouting, explicit endpoints, quick reconnection.
@@ -44,6 +47,25 @@ def zenoh_config(
     }.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def opened(config: zenoh.Config) -> zenoh.Session:
+    """A session; without shared memory where there is no room for it. Raises ZError."""
+    try:
+        return zenoh.open(config)
+    except BaseException as error:  # a panic of Zenoh is no Exception
+        if "shm" not in str(error).lower():
+            raise
+        log.warning("messages go without shared memory: %s", error)
+        config.insert_json5("transport/shared_memory/enabled", "false")
+        return zenoh.open(config)
+
+
+def locator(session: zenoh.Session, endpoint: str) -> str:
+    """Where a session in router mode really listens: `endpoint` with its port filled in."""
+    replies = session.get(f"@/{session.zid()}/router", timeout=5.0)
+    answers = [json.loads(reply.ok.payload.to_string()) for reply in replies if reply.ok]
+    return str(answers[0]["locators"][0]) if answers and answers[0]["locators"] else endpoint
 
 
 def _tls(credentials: str) -> dict[str, object]:

@@ -17,7 +17,7 @@ from services.actor.targets import Targets
 from services.processes import ACTOR, DRIVER, LEARNER, MAIN
 from shared.complaints import Complaints
 from shared.config import Config, Numerics
-from shared.errors import CorridorError
+from shared.errors import CorridorError, DiskFull
 from shared.inbox import Inbox
 from shared.keys import ACTOR_STATE, LEARNER_STATE, OBSERVATION
 from shared.messages import (
@@ -106,11 +106,17 @@ class ActorLoop:
         return robot in self._sessions or (rested and len(self._sessions) < MAX_ROBOTS)
 
     def _forget_one(self) -> None:
-        """End the session of a robot that nobody drives any more, as far as can be heard."""
-        for robot, session in self._sessions.items():
-            if session.silent and not self._inbox.lives(DRIVER.name, robot):
+        """Put away the robot that nobody has driven for the longest time; it can come back."""
+        idle_s = {
+            robot: session.idle_s
+            for robot, session in self._sessions.items()
+            if not self._inbox.lives(DRIVER.name, robot)
+        }
+        robot = max(idle_s, key=idle_s.__getitem__, default="")
+        if robot and idle_s[robot]:
+            with suppress(DiskFull):
+                self._sessions[robot].save()
                 del self._sessions[robot]
-                return
 
     @contextmanager
     def _alone(self, robot: str) -> Iterator[None]:

@@ -101,9 +101,11 @@ class Session:
                 self._finish(observation)
 
     @property
-    def silent(self) -> bool:
-        """Whether nothing was heard of the robot for a while."""
-        return self._served.silent(time.monotonic())
+    def idle_s(self) -> float:
+        """How long nothing was heard of the robot; 0 while it is served, or owes an episode."""
+        now_s = time.monotonic()
+        gone = self._served.silent(now_s) and self._pending is None
+        return now_s - self._served.heard_s if gone else 0.0
 
     def advance(self) -> Observation | None:
         """Do what can be done now: hand over, wait for training. Raises Stopped and StateError.

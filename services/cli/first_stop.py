@@ -57,7 +57,6 @@ def send(arguments: Sequence[str]) -> FirstStop | None:
             zenoh_config(
                 "client",
                 connect=[target.endpoint],
-                shared_memory=False,
                 credentials=target.credentials,
             )
         )

@@ -19,6 +19,7 @@ from services.cli.options import (
     SeedOption,
     SetOption,
     default_folder,
+    import_installed,
     load,
     reach,
 )
@@ -77,6 +78,11 @@ def up(
         preset, config, set_, run, seed, endpoint, credentials, {"run.episodes": episodes}
     )
     from services.launcher.up import run_all
+
+    if loaded.robot.kind == "sim":  # refused before anything starts
+        import_installed("services.robot_driver.simulated.world", "sim").load_world(
+            loaded.robot.world
+        )
 
     code = run_all(
         loaded,

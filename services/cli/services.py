@@ -70,6 +70,7 @@ def _add_service(app: typer.Typer, process: Process) -> None:
 def serve(process: Process, config: Config, folder: Path) -> int:
     """Run one service until it stops; returns its exit code."""
     from shared import roles, run_record
+    from shared.numerics import ROLES, settle_all
     from shared.service import guarded, new_life, setup_logging, starting
     from shared.settings import claim
 
@@ -86,6 +87,7 @@ def serve(process: Process, config: Config, folder: Path) -> int:
     ):
         run_record.begin(folder, claim(folder, config))
         setup_logging(process.name, folder)
+        settle_all(config, folder, [role for role in ROLES if role == process.name])
         return guarded(process.name, run)
 
 
@@ -111,4 +113,10 @@ def router(
         tether()
     from services.router.service import run as route
 
-    route(bus.endpoint, typer.echo, bus.credentials, insecure=insecure)
+    route(
+        bus.endpoint,
+        typer.echo,
+        bus.credentials,
+        insecure=insecure,
+        shared_memory=bus.shared_memory,
+    )

@@ -54,6 +54,12 @@ class Keys:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
     def _run(self) -> None:
+        try:
+            self._read_all()
+        finally:
+            self.active = False
+
+    def _read_all(self) -> None:
         signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
         while not self._done.is_set():
             self.active = self._take()

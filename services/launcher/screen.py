@@ -54,8 +54,8 @@ class Screen:
             ):
                 while (view := self._next()) is not None:
                     display.show(view)
-        except (OSError, ValueError) as error:  # nobody reads any more: the run goes on
-            log.warning("the live view ends: %s", error)
+        except Exception as error:  # nobody reads any more: the run goes on
+            log.warning("the live view ends: %s", error, exc_info=not isinstance(error, OSError))
 
     def _next(self) -> RunView | None:
         """The newest view not yet shown; None at the end."""

@@ -13,6 +13,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+import shutil
 import signal
 import subprocess
 import time
@@ -20,8 +21,9 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Literal, Self
+
+from shared.pacing import jittered
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +35,7 @@ FIRST_DELAY_S, LONGEST_DELAY_S = 0.25, 10.0
 STEADY_S = 30.0
 """A child that ran this long is restarted at once when it crashes."""
 FINAL_CODES = (2, 3, 4)
+MOST_OUTPUT_BYTES = 8 * 1024 * 1024
 TAIL_BYTES = 16 * 1024
 """As much of the output of an ended child is looked at."""
 
@@ -82,11 +85,8 @@ class Supervisor:
     ) -> None:
         """Prepare; nothing is started yet.
 
-        Args:
-            specs: what to run.
-            logs: existing folder for the output of each child, `<name>.out`.
-            environment: of all children.
-            pass_descriptors: files that stay open in the children.
+        logs: existing folder for the output of each child, `<name>.out`. pass_descriptors: files
+        that stay open in the children.
         """
         self._children = [_Child(spec, logs / f"{spec.name}.out") for spec in specs]
         self._environment, self._descriptors = dict(environment), tuple(pass_descriptors)
@@ -100,17 +100,13 @@ class Supervisor:
             raise
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.stop()
 
     def poll(self) -> Ending | None:
         """Look at all children once and restart crashed ones; returns why to end, if so."""
         for child in self._children:
+            child.trim()
             code = child.ended()
             if code in FINAL_CODES:
                 return Ending(code, f"{child.spec.name}: {child.last_line() or f'exit {code}'}")
@@ -201,9 +197,18 @@ class _Child:
         how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
         self._note = self._given_up or f"{how}: {self.last_line()}".removesuffix(": ")
         self._given_up = ""
-        self._due_s = time.monotonic() + self._delay_s
-        log.warning("%s crashed (%s), restart in %.1f s", self.spec.name, self._note, self._delay_s)
+        delay_s = jittered(self._delay_s)
+        self._due_s = time.monotonic() + delay_s
+        log.warning("%s crashed (%s), restart in %.1f s", self.spec.name, self._note, delay_s)
         self._delay_s = min(2 * self._delay_s, LONGEST_DELAY_S)
+
+    def trim(self) -> None:
+        """Begin the output anew once it is large. The part before is kept, where there is room."""
+        if self._output.exists() and self._output.stat().st_size > MOST_OUTPUT_BYTES:
+            with suppress(OSError):
+                shutil.copyfile(self._output, self._output.with_suffix(".out.1"))
+            os.truncate(self._output, 0)
+            self._offset = 0
 
     def is_due(self) -> bool:
         return self.process is None and not self.finished and time.monotonic() >= self._due_s

@@ -27,6 +27,8 @@ from shared import run_record, settings
 from shared.config import BusConfig, Config
 from shared.errors import ConfigError
 from shared.numerics import settle_all
+from shared.service import setup_logging
+from shared.statefile import write_atomically
 
 log = logging.getLogger(__name__)
 
@@ -42,15 +44,9 @@ def run_all(
 ) -> int:
     """Run everything until Ctrl-C, SIGTERM, the wanted number of episodes or a final error.
 
-    Args:
-        config: the resolved configuration.
-        folder: run folder.
-        listen: where the own router listens; None: on loopback, on a free port.
-        given: the endpoint was chosen on purpose, so the router there is used.
-        insecure: the own router may listen beyond loopback without credentials.
-
-    Returns the exit code. Raises ConfigError: the folder belongs to another configuration or is in
-    use, or the router must not listen there.
+    listen: where the own router listens; None: on loopback, on a free port. given: the endpoint was
+    chosen on purpose, so the router there is used. Returns the exit code. Raises ConfigError: the
+    folder belongs to another configuration or is in use, or the router must not listen there.
     """
     folder = folder.absolute()
     given = given or config.bus.endpoint != BusConfig().endpoint
@@ -67,8 +63,8 @@ def run_all(
         bus = config.bus.model_copy(update={"endpoint": endpoint})
         config = config.model_copy(update={"bus": bus})
         credentials = Path(bus.credentials).absolute() if bus.credentials else ""
-        (folder / "endpoint").write_text(f"{endpoint}\n{credentials}\n")
-        _log_to(folder / "logs")
+        write_atomically(folder / "endpoint", f"{endpoint}\n{credentials}\n".encode())
+        setup_logging("up", folder, screen=False)  # the terminal belongs to the display
         specs = child_specs(config, stored, folder, own)
         environment = {k: v for k, v in os.environ.items() if not k.startswith(settings.ENV_PREFIX)}
         supervisor = Supervisor(specs, folder / "logs", environment, [lock])
@@ -142,7 +138,8 @@ def child_specs(
         credentials = config.bus.credentials
         # That it may listen there has been decided before.
         secure = ("--credentials", credentials) if credentials else ("--insecure",)
-        specs.append(_spec(ROUTER, "--listen", own, *secure))
+        shared = f"--set=bus.shared_memory={str(config.bus.shared_memory).lower()}"
+        specs.append(_spec(ROUTER, "--listen", own, shared, *secure))
     # What may differ from the stored configuration, such as the endpoint, goes along.
     changes = settings.differences(stored, config)
     options = [f"--set={key}={settings.toml_value(value)}" for key, _, value in changes]
@@ -191,10 +188,3 @@ def stop_on_signals() -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _log_to(folder: Path) -> None:
-    """Log to a file only: the terminal belongs to the display."""
-    folder.mkdir(exist_ok=True)
-    form = "%(asctime)s up %(levelname)s %(message)s"
-    logging.basicConfig(filename=folder / "up.log", level=logging.INFO, format=form, force=True)

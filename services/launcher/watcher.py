@@ -36,6 +36,8 @@ class Watcher:
     """
 
     def __init__(self, config: Config) -> None:
+        bus = config.bus.model_copy(update={"shared_memory": False})
+        config = config.model_copy(update={"bus": bus})
         self._config = using(config, "operator", "watcher")
         self._done = threading.Event()
         self._bus: Bus | None = None
@@ -85,7 +87,9 @@ class Watcher:
             try:
                 with Bus(self._config.bus, self._config.run.name) as self._bus:
                     self._look(self._bus)
-            except RouterMissing:
+            except Exception as error:  # it must look again, whatever it is
+                if not isinstance(error, RouterMissing):
+                    log.exception("the watcher begins anew")
                 self.sight = Sight()
                 self._done.wait(LOOK_S)
         self._bus = None

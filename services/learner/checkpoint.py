@@ -1,5 +1,9 @@
 """Checkpoints: both networks, the optimiser and all counters in one file, replaced atomically.
 
+Each state goes to one of two files in turn that are not brought to disk: it survives a kill of the
+process and costs no disk, because a file that is removed soon is never written. `sync` makes the
+newest one the checkpoint. After a crash of the machine the others do not count.
+
 Random state needs no saving: every draw is a function of seed and position (`shared.rl.draws`).
 The checkpoint before the newest is kept beside it, for the case that the newest cannot be read.
 """
@@ -17,10 +21,12 @@ from safetensors.torch import save as save_safetensors
 from services.learner.history import Place
 from shared.errors import StateError
 from shared.rl.learning import Trainer
-from shared.statefile import set_aside, write_atomically
+from shared.statefile import needing_room, set_aside
+from shared.statefile import sync as sync_folder
 
 SCHEMA = 1
 PREVIOUS = ".previous"
+UNSYNCED = (".unsynced-0", ".unsynced-1")
 
 
 class Damaged(StateError):
@@ -30,10 +36,17 @@ class Damaged(StateError):
 def write(
     path: Path, trainer: Trainer, episode: int, identity: str, lineage: str = Place.lineage
 ) -> None:
-    """Write the state after `episode`: on disk when this returns.
+    """Write the state after `episode`: on disk when this returns. Raises like `keep`."""
+    _promote(path, keep(path, trainer, episode, identity, lineage))
+
+
+def keep(
+    path: Path, trainer: Trainer, episode: int, identity: str, lineage: str = Place.lineage
+) -> Path:
+    """Write the state after `episode`, and return where: it survives a kill, not a power cut.
 
     lineage: of the memory as of that episode. Raises FloatingPointError and writes nothing when a
-    number is not finite.
+    number is not finite; raises DiskFull.
     """
     header = {
         "schema": SCHEMA,
@@ -41,16 +54,38 @@ def write(
         "episode": episode,
         "lineage": lineage,
         "counters": trainer.counters(),
+        "boot": _boot(),
     }
     tensors = {name: t.cpu().contiguous() for name, t in trainer.tensors().items()}
     if odd := _not_finite(tensors):
         raise FloatingPointError(f"{odd} is not finite")
     data = save_safetensors(tensors, {"state": json.dumps(header)})
+    own = beside(path, UNSYNCED[episode % 2])
+    with needing_room(path):
+        own.parent.mkdir(parents=True, exist_ok=True)
+        own.unlink(missing_ok=True)
+        own.write_bytes(data)
+    return own
+
+
+def sync(path: Path) -> None:
+    """Bring the newest state to disk, if it is newer than the checkpoint. Raises DiskFull."""
+    newest = max((beside(path, name) for name in UNSYNCED), key=_age)
+    if _age(newest) > _age(path):
+        _promote(path, newest)
+
+
+def _promote(path: Path, newest: Path) -> None:
+    """Make a state the checkpoint; the one before is kept, the others are not needed."""
+    with needing_room(path), newest.open("rb") as file:
+        os.fsync(file.fileno())
     if path.exists():
-        previous = path.with_name(path.name + PREVIOUS)
-        previous.unlink(missing_ok=True)
-        os.link(path, previous)
-    write_atomically(path, data)
+        beside(path, PREVIOUS).unlink(missing_ok=True)
+        os.link(path, beside(path, PREVIOUS))
+    newest.replace(path)
+    for name in UNSYNCED:
+        beside(path, name).unlink(missing_ok=True)
+    sync_folder(path.parent)
 
 
 def read(path: Path, trainer: Trainer, identity: str) -> Place:
@@ -78,20 +113,44 @@ def read(path: Path, trainer: Trainer, identity: str) -> Place:
 
 
 def take_up(path: Path, trainer: Trainer, identity: str) -> Place:
-    """Read the learner's own checkpoint. One that cannot be read is set aside.
+    """Read the learner's own newest state. A checkpoint that cannot be read is set aside.
 
     Raises StateError as `read` does. After a damaged one the next start goes on from the one
     before, if there is one.
     """
+    if _age(path) >= 0:
+        sync(path)
     try:
         return read(path, trainer, identity)
     except Damaged as error:
         told = f"{error}; it lies at {set_aside(path)} now"
-        previous = path.with_name(path.name + PREVIOUS)
+        previous = beside(path, PREVIOUS)
         if not previous.exists():
             raise StateError(f"{told}, and the next start begins with new networks") from error
         previous.rename(path)
         raise StateError(f"{told}, and the next start goes on from the one before") from error
+
+
+def beside(path: Path, name: str) -> Path:
+    """One of the files beside a checkpoint."""
+    return path.with_name(path.name + name)
+
+
+def _boot() -> str:
+    """Which start of the machine this is; empty where nobody tells."""
+    told = Path("/proc/sys/kernel/random/boot_id")
+    return told.read_text().strip() if told.exists() else ""
+
+
+def _age(path: Path) -> int:
+    """The episode of a state; -1 if it cannot be read, or may not have come to disk as it is."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = json.loads(file.metadata()["state"])
+        counts = path.suffix == ".safetensors" or header["boot"] == _boot()
+        return int(header["episode"]) if counts else -1
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError):
+        return -1
 
 
 def _not_finite(tensors: dict[str, torch.Tensor]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
@@ -13,7 +13,8 @@ from shared.keys import CHANGES, SNAPSHOT
 from shared.messages import NO_LINEAGE, Change, ChangesRequest, FeedEnd, SnapshotRequest
 from shared.rl.memory import MIRROR, SampleStore
 
-TRANSFER_TIMEOUT_S = 60.0
+PATIENCE_S = 60.0
+"""Longest that a transfer stands still; one that goes on takes as long as it takes."""
 
 
 class Mirror:
@@ -26,19 +27,23 @@ class Mirror:
         """Lineage of the mirrored memory as of `number`."""
         self.resyncs = 0
 
-    def reach(self, bus: Bus, number: int, lineage: str) -> None:
+    def reach(
+        self, bus: Bus, number: int, lineage: str, progress: Callable[[], None] = lambda: None
+    ) -> None:
         """Bring the mirror to change `number` (beyond it only after a gap: then by snapshot).
 
-        lineage: of the memory as of that change. Raises BusError; the mirror then stands at a
-        complete change, or starts anew.
+        lineage: of the memory as of that change. progress: is called for each part; what it raises
+        ends the transfer. Raises BusError; the mirror then stands at a complete change, or starts
+        anew.
         """
         if self.number is not None and self.number >= number:
             return
         if self.number is not None:
             request = ChangesRequest(since=self.number, upto=number, lineage=self.lineage)
-            parts, end = _received(
-                bus.request_many(CHANGES, request, Change, FeedEnd, timeout_s=TRANSFER_TIMEOUT_S)
+            replies: Iterator[Change | FeedEnd] = bus.request_many(
+                CHANGES, request, Change, FeedEnd, patience_s=PATIENCE_S
             )
+            parts, end = _received(replies, progress)
             if not end.gone and (end.change, end.lineage) == (number, lineage):
                 self.number = None  # until all of them are in
                 for part in parts:
@@ -46,15 +51,15 @@ class Mirror:
                 self.number, self.lineage = number, lineage
                 return
             self.resyncs += 1
-        self._snapshot(bus, number, lineage)
+        self._snapshot(bus, number, lineage, progress)
 
-    def _snapshot(self, bus: Bus, number: int, lineage: str) -> None:
+    def _snapshot(self, bus: Bus, number: int, lineage: str, progress: Callable[[], None]) -> None:
         self.samples, self.number = SampleStore(), None
-        replies = bus.request_many(
-            SNAPSHOT, SnapshotRequest(), Change, FeedEnd, timeout_s=TRANSFER_TIMEOUT_S
-        )
+        request = SnapshotRequest()
+        replies = bus.request_many(SNAPSHOT, request, Change, FeedEnd, patience_s=PATIENCE_S)
         samples, rows, messages = SampleStore(), 0, 0
         for part in replies:
+            progress()
             if isinstance(part, FeedEnd):
                 _check_complete(part, rows, messages)
                 if part.change < number or (part.change == number and part.lineage != lineage):
@@ -70,9 +75,12 @@ class Mirror:
         raise PeerSilent(f"snapshot broke off after {rows} rows")
 
 
-def _received(replies: Iterable[Change | FeedEnd]) -> tuple[list[Change], FeedEnd]:
+def _received(
+    replies: Iterable[Change | FeedEnd], progress: Callable[[], None]
+) -> tuple[list[Change], FeedEnd]:
     parts: list[Change] = []
     for reply in replies:
+        progress()
         if isinstance(reply, FeedEnd):
             _check_complete(reply, sum(p.count for p in parts), len(parts))
             return parts, reply

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -24,7 +25,7 @@ from shared.numerics import settle
 from shared.rl.learning import Trained, Trainer
 from shared.rl.network import checked, to_bytes, weights_hash
 from shared.rl.schedule import Moment
-from shared.run_record import TRAINING, TRAINING_COLUMNS
+from shared.run_record import TRAINING, TRAINING_COLUMNS, Row
 from shared.service import TICK_S, Service, Stopped, service
 from shared.weights import parts
 
@@ -33,6 +34,8 @@ T = TypeVar("T")
 TAKEOVER = 2
 """How far above the versions that replay knows a learner without its checkpoint goes on: an actor
 may have one more than replay."""
+SYNC_S = 60.0
+"""Power cut or crash of the machine cost the turns of this time; each fit is brought to disk."""
 LAST_TAKEOVER = 2**31
 """Above this it does not: that many versions were never made."""
 
@@ -65,6 +68,7 @@ class LearnerLoop:
         self._metrics.restart([row for row in rows if int(row["episode"]) <= newest])
         self._activity: Activity = "waiting"
         self._trained = Trained(0.0, 0, 0, 0)
+        self._synced_s = -math.inf
         self._loss: float | None = None
         self._next_beat_s = 0.0
         self._told: Place | None = None
@@ -89,6 +93,7 @@ class LearnerLoop:
                     self._catch_up()
         finally:
             self._metrics.close()
+            checkpoint.sync(self._path)
 
     def _serve(self, *, announce: bool = False) -> None:
         """Answer requests, note what replay says, publish the heartbeat when due."""
@@ -160,11 +165,15 @@ class LearnerLoop:
         self._new = False
         changed = self._trainer.apply_target_rule(turn.episode, turn.bump)
         self._loss = float(np.mean(losses)) if losses else None
-        self._record(turn, self._trainer.train_steps - steps_before, time.monotonic() - start_s)
+        steps = self._trainer.train_steps - steps_before
+        row = self._row(turn, steps, time.monotonic() - start_s)
+        self._insist("write down a turn", lambda: self._metrics.write(row))
         self._activity = "checkpoint"
         try:
             weights = self._checked_weights() if changed else self._weights
-            checkpoint.write(self._path, self._trainer, turn.episode, self._identity, turn.lineage)
+            self._insist(
+                "write a checkpoint", lambda: self._keep(turn, fitted=bool(row["fitting"]))
+            )
         except FloatingPointError as error:
             raise self._diverged(turn, error) from error
         if changed:
@@ -172,12 +181,26 @@ class LearnerLoop:
         self._place, self._activity = Place(turn.episode, turn.lineage), "waiting"
         self._serve(announce=True)
 
+    def _keep(self, turn: Turn, fitted: bool) -> None:
+        """Write a checkpoint, and now and then bring it to disk. Raises DiskFull."""
+        place = (turn.episode, self._identity, turn.lineage)
+        checkpoint.keep(self._path, self._trainer, *place)
+        if fitted or time.monotonic() - self._synced_s >= SYNC_S:
+            checkpoint.sync(self._path)
+            self._synced_s = time.monotonic()
+
+    def _go_on(self) -> None:
+        """Serve in between. Raises Stopped."""
+        self._serve()
+        if self._me.stop.is_set():
+            raise Stopped("a turn")
+
     def _reach(self, turn: Turn) -> None:
         """Bring the mirror to a turn. Raises BusError, OtherTurn."""
         self._serve()
         followed = self._mirror.number
         try:
-            self._mirror.reach(self._me.bus, turn.change, turn.lineage)
+            self._mirror.reach(self._me.bus, turn.change, turn.lineage, self._go_on)
         except BusError:
             self._confirm(turn)
             raise
@@ -219,28 +242,24 @@ class LearnerLoop:
                     losses.append(trained.loss)
                 self._trained = trained
                 self._activity = "fitting" if trained.batches else "training"
-                self._serve()
-                if self._me.stop.is_set():
-                    raise Stopped("training")
+                self._go_on()
         except FloatingPointError as error:
             raise self._diverged(turn, error) from error
         return losses
 
-    def _record(self, turn: Turn, mini_batches: int, seconds: float) -> None:
+    def _row(self, turn: Turn, mini_batches: int, seconds: float) -> Row:
         trainer = self._trainer
-        self._metrics.write(
-            {
-                "episode": turn.episode,
-                "mini_batches": mini_batches,
-                "loss": self._loss if self._loss is not None else "",
-                "fitting": int(mini_batches > 0 and self._trained.batches > 0),
-                "train_steps": trainer.train_steps,
-                "fits": trainer.fits,
-                "weights_version": trainer.version,
-                "target_age": turn.episode - trainer.episode_at_copy,
-                "turn_seconds": round(seconds, 3),
-            }
-        )
+        return {
+            "episode": turn.episode,
+            "mini_batches": mini_batches,
+            "loss": self._loss if self._loss is not None else "",
+            "fitting": int(mini_batches > 0 and self._trained.batches > 0),
+            "train_steps": trainer.train_steps,
+            "fits": trainer.fits,
+            "weights_version": trainer.version,
+            "target_age": turn.episode - trainer.episode_at_copy,
+            "turn_seconds": round(seconds, 3),
+        }
 
     def _state(self) -> LearnerState:
         trainer, trained = self._trainer, self._trained

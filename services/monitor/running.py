@@ -98,5 +98,5 @@ def _of_folder(folder: Path, overrides: list[str]) -> Config:
     now = used(folder) or (stored.bus.endpoint, stored.bus.credentials)
     keys = ("bus.endpoint", "bus.credentials")
     there = [f"{key}={settings.toml_value(value)}" for key, value in zip(keys, now, strict=True)]
-    overrides = [*there, *overrides]
+    overrides = [*there, "bus.shared_memory=false", *overrides]  # an order waits for no memory
     return settings.load(file=folder / settings.FILE_NAME, overrides=overrides)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 from services.processes import MAIN
@@ -19,6 +20,7 @@ from services.replay.worker import TurnWorker
 from shared.bus import Request
 from shared.complaints import Complaints
 from shared.config import Config
+from shared.errors import DiskFull
 from shared.inbox import Inbox
 from shared.keys import (
     CHANGES,
@@ -33,6 +35,7 @@ from shared.messages import (
     ChangesRequest,
     Episode,
     EpisodeAck,
+    Message,
     MiniBatchRequest,
     ProgressRequest,
     ReplayState,
@@ -70,7 +73,6 @@ class Intake:
         self._inbox: Inbox = me.bus.inbox()
         self._bulk: Inbox = me.bus.inbox()
         self._worker = TurnWorker(me, storage, folder, self._inbox.wake)
-        self._bulk_failure: BaseException | None = None
         self._counters = storage.counters()
         self._version = max(1, storage.newest_weights_version())
         self._doubted: dict[tuple[str, int], float] = {}
@@ -82,13 +84,13 @@ class Intake:
         me.stop.on_set(self._bulk.wake)
 
     def run(self) -> None:
-        """Serve until stopped. Raises what ended one of the other threads, if something did."""
+        """Serve until stopped."""
         for stream in (EPISODE, PROGRESS):
             self._inbox.serve(stream, "*")
         self._inbox.serve(TURNS)
         for stream in (CHANGES, SNAPSHOT, MINI_BATCH):
             self._bulk.serve(stream)
-        bulk = threading.Thread(target=self._serve_bulk, name="bulk", daemon=True)
+        bulk = threading.Thread(target=self._stream_all, name="bulk", daemon=True)
         self._worker.start()
         bulk.start()
         try:
@@ -97,9 +99,6 @@ class Intake:
             self._me.stop.set("finished")
             self._worker.join(4.0)
             bulk.join(4.0)
-        for failure in (self._worker.failure, self._bulk_failure):
-            if failure is not None and not isinstance(failure, Stopped):
-                raise failure
 
     def _serve(self) -> None:
         next_beat_s, shown = 0.0, None
@@ -107,7 +106,11 @@ class Intake:
             self._inbox.wait(TICK_S)
             for request in self._inbox.requests():
                 with request:
-                    self._answer(request)
+                    try:
+                        self._answer(request)
+                    except DiskFull as error:
+                        self._complaints.tell("disk", str(error))
+                        request.refuse(str(error))
             now_s, view = time.monotonic(), self._worker.view
             if view.position != shown or now_s >= next_beat_s:
                 next_beat_s, shown = now_s + self._me.config.bus.heartbeat_s, view.position
@@ -199,32 +202,28 @@ class Intake:
             **_totals(counters),
         )
 
-    def _serve_bulk(self) -> None:
-        """The bulk thread; a failure ends the service, visibly."""
-        try:
-            self._stream_all()
-        except BaseException as error:  # noqa: BLE001  (raised again by the intake thread)
-            self._bulk_failure = error
-            self._me.stop.set(f"the bulk thread ended: {error!r}")
-
     def _stream_all(self) -> None:
+        """The work of the bulk thread."""
         while not self._me.stop.is_set():
             self._bulk.wait(TICK_S)
             for request in self._bulk.requests():
                 with request:
-                    self._stream(request)
+                    for part in self._parts(request.message):
+                        request.reply(part)
+                        if self._me.stop.is_set():
+                            raise Stopped("a transfer")
 
-    def _stream(self, request: Request) -> None:
-        message = request.message
+    def _parts(self, message: Message) -> Iterable[Message]:
+        """What answers a request for much."""
+        feed = self._storage.feed
         if isinstance(message, ChangesRequest):
-            for part in self._storage.feed.changes(message.since, message.upto, message.lineage):
-                request.reply(part)
-        elif isinstance(message, SnapshotRequest):
-            for part in self._storage.feed.snapshot():
-                request.reply(part)
-        elif isinstance(message, MiniBatchRequest):
+            return feed.changes(message.since, message.upto, message.lineage)
+        if isinstance(message, SnapshotRequest):
+            return feed.snapshot()
+        if isinstance(message, MiniBatchRequest):
             draw = generator(self._me.config.run.seed, "foreign mini-batch", message.key)
-            request.reply(self._storage.feed.mini_batch(message.size, draw))
+            return [feed.mini_batch(message.size, draw)]
+        return []
 
 
 def _totals(counters: Counters) -> dict[str, int]:

@@ -100,7 +100,7 @@ class Storage:
         """
         identity = f"{episode.robot}/{episode.life}/{episode.number}"
         summary, db = _summary(episode), self._tables.db
-        with self._tables.env.begin(write=True) as txn:
+        with self._tables.writing() as txn:
             counters = Counters.from_dict(self._tables.meta(txn, "counters"))
             known = txn.get(identity.encode(), db=db["identity"])
             if known is not None:
@@ -167,7 +167,7 @@ class Storage:
     ) -> Position:
         """Write everything one turn changed, in one transaction, and number the changes."""
         commit, summary = submission.commit, submission.record
-        with self._tables.env.begin(write=True) as txn:
+        with self._tables.writing() as txn:
             position = self._tables.position(txn)
             number = self._write_changes(txn, position, submission, memory, done)
             if done.discarded.marked:

@@ -19,6 +19,9 @@ leaves one of the two states, and the turn is done again from the first.
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,7 +34,7 @@ import numpy.typing as npt
 from services.replay.footprint import Mapping
 from services.replay.numbering import Commit, Counters
 from shared.config import MemoryConfig
-from shared.errors import StateError
+from shared.errors import ConfigError, DiskFull, StateError
 from shared.facts import IMAGE_SHAPE
 from shared.messages import NO_LINEAGE
 from shared.rl.memory import SAMPLE
@@ -46,6 +49,8 @@ TABLES = (
     *("meta", "commits", "identity", "lives", "images", "samples"),
     *("dead", "columns", "changes", "turns"),
 )
+LEAST_FREE_BYTES = 1 << 20
+"""With less room on the disk LMDB fails in several ways."""
 Txn = Any
 
 
@@ -96,12 +101,25 @@ class Tables:
     """The open files, and what reading and writing within a transaction share."""
 
     def __init__(self, folder: Path, config: MemoryConfig, identity: str) -> None:
-        """Open or create. Raises StateError when the files belong to another run or schema."""
+        """Open or create.
+
+        Raises StateError when the files belong to another run or schema, ConfigError when they
+        cannot be mapped.
+        """
         folder.mkdir(parents=True, exist_ok=True)
-        self.env = lmdb.open(str(folder), map_size=MAP_BYTES, max_dbs=len(TABLES), max_readers=64)
+        self._folder = folder
+        try:
+            self.env = lmdb.open(
+                str(folder), map_size=MAP_BYTES, max_dbs=len(TABLES), max_readers=64
+            )
+        except (MemoryError, lmdb.MemoryError) as error:
+            raise ConfigError(
+                f"{folder}: expected {MAP_BYTES >> 30} GB of address space for the replay memory, "
+                "which takes no memory: allow it with `ulimit -v unlimited`"
+            ) from error
         self._mapping = Mapping(folder / "data.mdb")
         self.db = {name: self.env.open_db(name.encode()) for name in TABLES}
-        with self.env.begin(write=True) as txn:
+        with self.writing() as txn:
             known = self.meta(txn, "identity")
             if known is None:
                 self.put_meta(txn, "identity", [SCHEMA, identity])
@@ -115,9 +133,16 @@ class Tables:
                     f"found {list(known)}: choose another run folder"
                 )
 
-    def close(self) -> None:
-        """Close the files; all other threads must be done with them."""
-        self.env.close()
+    @contextmanager
+    def writing(self) -> Iterator[Txn]:
+        """A write transaction, on disk at its end. Raises DiskFull: then all is as before."""
+        try:
+            with self.env.begin(write=True) as txn:
+                yield txn
+        except lmdb.Error as error:
+            if shutil.disk_usage(self._folder).free >= LEAST_FREE_BYTES:
+                raise
+            raise DiskFull(f"disk full: {self._folder}: {error}") from error
 
     def position(self, txn: Txn) -> Position:
         """Return how far the turns have come."""

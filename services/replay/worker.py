@@ -69,7 +69,6 @@ class TurnWorker(threading.Thread):
         self._metrics = MetricsLog(folder / EPISODES, REPLAY_COLUMNS)
         self._began_s = 0.0
         self._recent: deque[int] = deque(maxlen=100)
-        self.failure: BaseException | None = None
         self.view = View(storage.position())
         me.stop.on_set(self._wake.set)
 
@@ -78,7 +77,7 @@ class TurnWorker(threading.Thread):
         self._wake.set()
 
     def run(self) -> None:
-        """Work until the service stops; a failure stops the service."""
+        """Work until the service stops."""
         try:
             memory = self._load()
             while not self._me.stop.is_set():
@@ -88,9 +87,6 @@ class TurnWorker(threading.Thread):
                     self._wake.clear()
                     continue
                 self._turn(memory, pending)
-        except BaseException as error:  # noqa: BLE001  (raised again by the intake thread)
-            self.failure = error
-            self._me.stop.set(f"the turn worker ended: {error!r}")
         finally:
             self._metrics.close()
 
@@ -123,8 +119,11 @@ class TurnWorker(threading.Thread):
             self._recent.append(int(record["fitness"]))
             worlds = submission.rows["world"]
             world = memory.worlds[int(worlds[-1])] if len(worlds) else ""
-            self._metrics.write(self._row(commit, record, world, memory, done))
-        position = self._storage.apply_turn(submission, memory, done)
+            row = self._row(commit, record, world, memory, done)
+            self._me.insist("write down an episode", lambda: self._metrics.write(row))
+        position = self._me.insist(
+            "keep a turn", lambda: self._storage.apply_turn(submission, memory, done)
+        )
         if done.discarded.warning:
             self._me.log.warning("episode %d: %s", commit.episode, done.discarded.warning)
         self._show(memory, position=position, activity="idle")

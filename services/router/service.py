@@ -26,17 +26,12 @@ def run(
     credentials: str = "",
     *,
     insecure: bool = False,
+    shared_memory: bool = False,
 ) -> None:
-    """Route until SIGTERM or SIGINT.
+    """Route until SIGTERM or SIGINT. Raises ConfigError when it cannot or must not listen there.
 
-    Args:
-        endpoint: where to listen; port 0 takes a free one.
-        announce: called once with the locator that clients connect to.
-        credentials: folder of the router, with its configuration; empty: open to everybody.
-        insecure: whether it may then be reached from other machines.
-
-    Raises:
-        ConfigError: it cannot or must not listen there.
+    announce: called once with the locator that clients connect to. credentials: folder of the
+    router, with its configuration; empty: open to everybody, with `insecure` from anywhere.
     """
     refuse_open_door(endpoint, credentials, insecure)
     file = Path(credentials) / "router.json5" if credentials else None
@@ -47,7 +42,7 @@ def run(
 
     signal.signal(signal.SIGTERM, on_signal)
     signal.signal(signal.SIGINT, on_signal)
-    with open_router(endpoint, file) as locator:
+    with open_router(endpoint, file, shared_memory=shared_memory) as locator:
         log.info("router listens on %s", locator)
         announce(locator)
         while not stop.wait(TICK_S):

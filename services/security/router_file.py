@@ -25,7 +25,7 @@ LARGEST = 32 * MIB
 def write(authority: Authority) -> Path:
     """Write the router's configuration for those who are on the roster now."""
     folder = authority.folder / ROUTER
-    plain = zenoh_config("router", listen=[LISTEN], shared_memory=False)
+    plain = zenoh_config("router", listen=[LISTEN])
     settings = {key: json.loads(plain.get_json(key)) for key in AS_ALWAYS}
     settings["transport"]["link"]["rx"]["max_message_size"] = LARGEST
     settings["transport"]["link"]["tls"] = {

@@ -31,8 +31,8 @@ FILES = ("docker-compose.yml", "docker-compose.own-router.yml", "tests/compose/s
 PROJECT = "corridor-compose-test"
 BASE_IMAGE = "python:3.11-slim-bookworm"
 RUN = "compose-test"
-SERVICES = ("router", "driver-sim", "actor", "replay", "learner")
-IMAGES = ("router", "driver-sim", "driver-robotino", "driver-ros2", "actor", "replay", "learner")
+SERVICES = ("router", "driver", "actor", "replay", "learner")
+IMAGES = ("router", "driver-demo", "actor", "replay", "learner")
 EPISODES, MORE = 20, 5
 """Episodes before the first kill, and after each."""
 PATIENCE_S = 600.0
@@ -41,7 +41,6 @@ BUILD_S = 3600.0
 """Longest time to make base image and images, which may have to fetch gigabytes."""
 SETTINGS = {
     "BASE_IMAGE": BASE_IMAGE,
-    "COMPOSE_PROFILES": "sim",
     "CORRIDOR_RUN__NAME": RUN,
     "CORRIDOR_RUN__SEED": "7",
     "PRESET": "demo",
@@ -170,7 +169,7 @@ class Trial:
             self.show("deploy/make-base-image.sh", BASE_IMAGE)
         self._environment["PYTHON"] = sys.executable
         files = [word for name in FILES for word in ("-f", name)]
-        self.show("deploy/build-images.sh", *files, *IMAGES)
+        self.show("deploy/build-images.sh", *files, *SERVICES)
         self.found("images are built")
         for name, size in self.sizes().items():
             self.tell(f"    {name:24} {size / 1e6:6.0f} MB")

@@ -37,7 +37,9 @@ ROOT = Path(__file__).parents[2]
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
 ROLES = [process.name for process in processes.SERVICES]
 DRIVERS = dict(zip(DRIVER.extras, DRIVER.images, strict=True))
-"""Service and image of each profile."""
+"""Image of each kind of robot."""
+IMAGE_OF = {"driver": "driver-sim"}
+"""Stage of the image of a service, where it has another name."""
 SERVICES = [image for process in processes.SERVICES for image in process.images]
 IMAGES = ["router", *SERVICES]
 FOREIGN = {
@@ -196,19 +198,21 @@ def test_the_image_context_holds_what_is_copied() -> None:
 
 def test_compose_runs_every_service_with_restart_policy_and_health_check() -> None:
     tree = compose("docker-compose.yml")
-    assert set(tree["services"]) == {"router", "credentials", "operator", *SERVICES}
-    for name in SERVICES:
+    assert set(tree["services"]) == {"router", "credentials", "operator", *ROLES}
+    for name in ROLES:
         service = tree["services"][name]
-        assert service["build"]["target"] == name
-        assert service["image"] == f"corridor-{name}"
-        assert service["command"][0] == role(name)
-        assert service["restart"] == "on-failure"
+        target = service["build"]["target"]
+        assert target == ("driver-demo" if name == "driver" else name)
+        assert service["image"] == f"corridor-{target}"
+        assert service["command"][0] == name
+        assert "profiles" not in service  # `docker compose up` starts it, and so does the machine
+        assert service["restart"] == "unless-stopped"
         assert service["depends_on"] == {
             "credentials": {"condition": "service_completed_successfully"},
             "router": {"condition": "service_started"},
         }
         check = json.dumps(service["healthcheck"]["test"][1:])
-        assert f"CMD {check}" in stages()[name][1]
+        assert f"CMD {check}" in stages()[IMAGE_OF.get(name, name)][1]
     assert tree["services"]["router"]["restart"] == "unless-stopped"
 
 
@@ -225,20 +229,20 @@ def test_containers_may_do_nothing_but_their_work() -> None:
 
 def test_state_lies_in_named_volumes() -> None:
     tree = compose("docker-compose.yml")
-    for name in SERVICES:
-        assert tree["services"][name]["volumes"] == [
-            f"{role(name)}:/data",
-            f"{role(name)}-credentials:/credentials:ro",
-        ]
-        assert role(name) in tree["volumes"]
+    for name in ROLES:
+        volumes = [f"{name}:/data", f"{name}-credentials:/credentials:ro"]
+        assert tree["services"][name]["volumes"] == volumes
+        assert name in tree["volumes"]
 
 
-def test_a_profile_chooses_the_driver() -> None:
-    services = compose("docker-compose.yml")["services"]
-    chosen = {n: s["profiles"] for n, s in services.items() if "profiles" in s}
-    assert chosen.pop("operator") == ["tools"]
-    assert chosen == {name: [profile] for profile, name in DRIVERS.items()}
-    assert example()["COMPOSE_PROFILES"] in DRIVERS
+def test_one_variable_chooses_the_robot_and_its_driver() -> None:
+    for preset in settings.preset_names():
+        driver = compose("docker-compose.yml", {"PRESET": preset})["services"]["driver"]
+        kind = settings.load(preset).robot.kind
+        target = driver["build"]["target"]
+        base = stages()[target][0] if target not in IMAGES else target
+        assert base == DRIVERS[kind]
+        assert driver["command"][2] == preset
 
 
 def test_the_router_is_zenohd_of_the_version_of_its_clients() -> None:
@@ -293,7 +297,7 @@ def test_all_services_get_the_same_valid_configuration(
     variables: dict[str, str], gpu: bool
 ) -> None:
     found = set()
-    for service in SERVICES:
+    for service in ROLES:
         tree = compose("docker-compose.yml", variables)["services"][service]
         environment = dict(tree["environment"])
         if gpu:
@@ -310,7 +314,7 @@ def test_all_services_get_the_same_valid_configuration(
 def test_the_trial_takes_a_valid_configuration_of_all_services() -> None:
     trial = compose("tests/compose/small.yml")["services"]
     services = compose("docker-compose.yml")["services"]
-    assert set(trial) == {"driver-sim", "actor", "replay", "learner"}
+    assert set(trial) == set(ROLES)
     for name, service in trial.items():
         environment = {**services[name]["environment"], **service["environment"]}
         config = settings.load("demo", env=environment)
@@ -325,7 +329,7 @@ def test_the_gpu_goes_to_those_whose_device_it_is() -> None:
 def test_the_example_names_the_variables_of_the_compose_files_and_no_others() -> None:
     names = ("docker-compose.yml", "docker-compose.own-router.yml")
     used = set(re.findall(r"\$\{(\w+)", "".join((ROOT / name).read_text() for name in names)))
-    assert used | {"COMPOSE_PROFILES"} == set(example())
+    assert used == set(example())
 
 
 # ---------------------------------------------------------------- health
@@ -422,6 +426,23 @@ def test_the_check_says_in_one_line_what_is_or_is_wrong(
     said = capsys.readouterr()
     assert said.out == "accepts sessions\n"
     assert said.err.count("\n") == 2
+
+
+def test_a_service_that_hangs_is_killed_by_its_tenth_check_in_a_row(tmp_path: Path) -> None:
+    answer = tmp_path / "python"
+
+    def check(code: int) -> str:
+        answer.write_text(f"#!/bin/sh\nexit {code}\n")
+        answer.chmod(0o755)
+        environment = {"PATH": f"{tmp_path}:{os.environ['PATH']}", "KILL": "echo killed"}
+        environment["FAILURES"] = str(tmp_path / "failures")
+        command = ["/bin/sh", str(ROOT / "deploy" / "healthy"), "actor"]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        assert done.returncode == code
+        return done.stdout
+
+    assert [check(code) for code in (1, 1, 0)] == ["", "", ""]
+    assert [check(1) for _ in range(11)] == [""] * 9 + ["killed\n", ""]
 
 
 def test_what_the_trial_reads_from_disk_is_what_was_acknowledged(tmp_path: Path) -> None:

@@ -78,7 +78,7 @@ def store_and_mirror(called: dict[str, int], folder: Path) -> None:
     """One more episode over disk into a full memory, and on to the learner's copy."""
 
     class FeedBus:
-        def request_many(self, _: Any, request: Any, *types: Any, timeout_s: float) -> Any:
+        def request_many(self, _: Any, request: Any, *types: Any, **__: Any) -> Any:
             if hasattr(request, "since"):
                 return storage.feed.changes(request.since, request.upto, request.lineage)
             return storage.feed.snapshot()

@@ -147,8 +147,8 @@ def test_estop_latches_until_cleared_and_the_run_goes_on(run_name: str, tmp_path
         inbox.subscribe(ROBOT_STATE)
 
         def command(name: RobotOrder) -> RobotState:
-            inbox.take(ROBOT_STATE, RobotState)
             assert order(cluster.bus, name, "", lambda _: None)
+            inbox.take(ROBOT_STATE, RobotState)  # what was sent before
 
             def beat() -> RobotState | None:
                 return next((s for _, s in inbox.take(ROBOT_STATE, RobotState)), None)

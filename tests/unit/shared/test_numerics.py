@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
 
-from shared import numerics
+from shared import numerics, settings
 from shared.config import (
     ActorNumerics,
     Config,
@@ -129,6 +130,7 @@ def test_a_gpu_is_taken_where_there_is_one(
     gpu: bool, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(numerics, "_has_gpu", lambda: gpu)
+    monkeypatch.setattr(numerics, "_seconds", lambda *_: [1.0])
     wanted = LearnerNumerics(device="auto", threads=0)
     assert not wanted.settled
     chosen = numerics.choose(OPEN, wanted, "learner")
@@ -140,3 +142,83 @@ def test_a_gpu_is_taken_where_there_is_one(
 def test_the_learner_is_measured_by_training(tmp_path: Path) -> None:
     chosen = numerics.choose(OPEN, LearnerNumerics(precision="auto", threads=0), "learner")
     assert chosen.settled
+
+
+# ------------------------------------------------------------------ accelerators that fail
+
+
+BROKEN = """import json, os, pathlib, signal, sys, time
+folder, left_out, *roles = sys.argv[1:]
+os.write(1, b"trying plain\\n")
+if "openvino" not in json.loads(left_out):
+    os.write(1, b"trying openvino\\n")
+    {ends}
+for role in roles:
+    path = pathlib.Path(folder, "numerics", role + ".json")
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("{{}}")
+"""
+UNSETTLED = Config(numerics=NumericsConfig(actor=ActorNumerics(engine="auto")))
+
+
+@pytest.mark.parametrize(
+    ("ends", "told"),
+    [
+        ("os.kill(os.getpid(), signal.SIGILL)", "SIGILL"),
+        ("raise ImportError('no AVX here')", "ImportError: no AVX here"),
+        ("time.sleep(60)", "it took longer than 0 s"),
+    ],
+)
+def test_an_accelerator_that_fails_is_left_out_and_named_once(
+    ends: str,
+    told: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    command = (sys.executable, "-S", "-c", BROKEN.format(ends=ends))
+    monkeypatch.setattr(numerics, "COMMAND", command)
+    if "sleep" in ends:
+        monkeypatch.setattr(numerics, "TRY_S", 0.4)
+    numerics.settle_all(UNSETTLED, tmp_path)
+    assert (tmp_path / "numerics" / "actor.json").exists()
+    assert [record.getMessage() for record in caplog.records] == [
+        f"numerics: openvino does not work here and is left out: {told}"
+    ]
+
+
+def test_what_fails_without_an_accelerator_is_told_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = (sys.executable, "-c", "raise OSError('libtorch.so: no such file')")
+    monkeypatch.setattr(numerics, "COMMAND", command)
+    with pytest.raises(ConfigError, match=r"actor cannot be settled here: OSError: libtorch\.so"):
+        numerics.settle_all(UNSETTLED, tmp_path)
+
+
+def test_an_openvino_that_dies_leaves_torch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A processor without the instructions it was built for: SIGILL when it is imported."""
+    (tmp_path / "openvino").mkdir()
+    dies = "import os, signal\nos.kill(os.getpid(), signal.SIGILL)\n"
+    (tmp_path / "openvino" / "__init__.py").write_text(dies)
+    config = UNSETTLED.model_copy(update={"network": NetworkConfig(filters=4)})
+    folder = tmp_path / "run"
+    settings.claim(folder, config)
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{Path(numerics.__file__).parents[1]}")
+    numerics.settle_all(config, folder)
+    assert numerics.settle(config, folder, "actor").engine == "torch"
+    assert "openvino does not work here and is left out: SIGILL" in caplog.text
+
+
+def test_what_failed_is_not_tried_again_alone_or_together(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(numerics, "_left_out", ["openvino", "cuda bfloat16"])
+    allowed = [name for name in NAMES if numerics._may_try(name)]
+    assert allowed == ["plain", "bfloat16", "cuda"]
+    assert capfd.readouterr().out.splitlines() == [f"trying {name}" for name in NAMES]
+
+
+NAMES = ("plain", "bfloat16", "openvino", "openvino bfloat16", "cuda", "cuda bfloat16")

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from shared import run_record
 from shared.config import Config
+from shared.errors import DiskFull
+from shared.metrics import MetricsLog
 from shared.run_record import EPISODE_COLUMNS, REPLAY_COLUMNS, TRAINING_COLUMNS, RunInfo
 
 
@@ -40,3 +45,47 @@ def test_a_table_of_another_schema_is_refused(tmp_path: Path, header: str) -> No
     (tmp_path / "episodes.csv").write_text(f"{header}\n")
     with pytest.raises(ValueError, match=r"episodes\.csv: expected the columns episode, stage"):
         run_record.read_episodes(tmp_path)
+
+
+def test_on_a_full_disk_a_table_gets_all_of_a_row_or_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = dict.fromkeys(TRAINING_COLUMNS, "1")
+    with pytest.raises(DiskFull, match="disk full: /dev/full"):
+        run_record.append_csv(Path("/dev/full"), TRAINING_COLUMNS, [row])
+    path = tmp_path / "training.csv"
+    run_record.append_csv(path, TRAINING_COLUMNS, [row])
+    before = path.read_bytes()
+    with monkeypatch.context() as full:
+        full.setattr(os, "fsync", lambda _: os.write(os.open("/dev/full", os.O_WRONLY), b"x"))
+        with pytest.raises(DiskFull):
+            run_record.write_csv(path, TRAINING_COLUMNS, [row] * 1000)
+    assert (path.read_bytes(), os.listdir(tmp_path)) == (before, ["training.csv"])
+    torn = SimpleNamespace(tell=lambda: 7, write=lambda data: len(data) - 1, truncate=cut.append)
+    with monkeypatch.context() as full:
+        full.setattr(Path, "open", lambda *_, **__: contextlib.nullcontext(torn))
+        with pytest.raises(DiskFull):
+            run_record.append_csv(path, TRAINING_COLUMNS, [row])
+    assert cut == [7]
+
+
+def test_tensorboard_shows_ever_fewer_episodes_and_a_full_disk_stops_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    metrics, shown = MetricsLog(tmp_path / "training.csv", TRAINING_COLUMNS), []
+    monkeypatch.setattr(metrics, "_show", lambda episode, _: shown.append(episode))
+    monkeypatch.setattr("shared.metrics.append_csv", lambda *_: None)
+    for episode in range(1, 100_001):
+        metrics.write({"episode": episode})
+    assert shown[:4096] == list(range(1, 4097))
+    assert 4096 < len(shown) < 16_000
+    monkeypatch.setattr(metrics, "_show", fails)
+    metrics.write({"episode": 1})
+    assert "TensorBoard lacks episode 1: no space" in caplog.text
+
+
+cut: list[int] = []
+
+
+def fails(*_: object) -> None:
+    raise OSError("no space")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import tomllib
 from pathlib import Path
@@ -190,11 +191,34 @@ def test_claim_refuses_a_folder_of_another_configuration(
     tmp_path: Path, override: str, message: str
 ) -> None:
     settings.claim(tmp_path, settings.load("demo"))
+    (tmp_path / "training.csv").write_text("episode\n" * 999)
     with pytest.raises(ConfigError) as caught:
         # A difference that would be allowed comes first in the tree and must not be blamed.
         settings.claim(tmp_path, settings.load("demo", overrides=["run.episodes=5", override]))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_folder_in_which_nothing_ran_takes_the_corrected_configuration(tmp_path: Path) -> None:
+    wrong, right = (
+        settings.load("demo", overrides=[f"robot.world={w}"]) for w in ("pluss", "plus")
+    )
+    settings.claim(tmp_path, wrong)
+    (tmp_path / "run.json").touch()
+    for name in ("logs", "numerics", "roles", "replay"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "replay" / "data.mdb").write_bytes(bytes(8192))  # as if it could not be mapped
+    with (tmp_path / "lock").open("w") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        with pytest.raises(ConfigError, match="another configuration"):  # it is starting now
+            settings.claim(tmp_path, right)
+    assert settings.claim(tmp_path, right) == settings.read_folder(tmp_path) == right
+    assert not {"numerics", "run.json"} & set(os.listdir(tmp_path))
+
+
+def test_a_folder_whose_name_is_no_text_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"'\S*\\udcff': expected a name in UTF-8"):
+        settings.claim(tmp_path / os.fsdecode(b"run\xff"), Config())
 
 
 def test_claim_of_a_damaged_folder_is_a_state_error(tmp_path: Path) -> None:

@@ -111,7 +111,7 @@ class Learner:
             self._heard.append(message(LearnerState, weights_version=version))
             self._arrived.notify_all()
 
-    def request_many(self, *_: Any, everybody: bool = False) -> Any:
+    def request_many(self, *_: Any, everybody: bool = False, **__: Any) -> Any:
         self.asked += 1
         version, data = self.serves
         return weights.parts(version, data, weights_hash(data))

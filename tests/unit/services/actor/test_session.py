@@ -14,6 +14,7 @@ from builders import FakePredictor, make_config, make_observation
 
 from services.actor.courier import Delivery
 from services.actor.heard import Newest
+from services.actor.service import ActorLoop
 from services.actor.session import Session
 from shared.messages import Action, Episode, EpisodeAck, LearnerState, RobotProgress, image_array
 
@@ -132,3 +133,36 @@ def test_the_episodes_of_a_life_are_numbered_from_0_whatever_it_took_over(tmp_pa
         (lives[0], 0),
         (lives[1], 0),
     ]
+
+
+@pytest.mark.parametrize(
+    ("given", "left"),
+    [
+        ({"a": (9.0, 1), "b": (70.0, 0), "c": (5.0, 0)}, "ac"),  # the longest gone
+        ({"a": (9.0, 1), "b": (70.0, 1), "c": (5.0, 0)}, "ab"),  # whose driver is not there
+        ({"a": (0.0, 0), "b": (0.0, 0)}, "ab"),  # all are heard, or owe an episode
+    ],
+)
+def test_the_robot_that_is_gone_for_longest_makes_room(
+    given: dict[str, tuple[float, int]], left: str
+) -> None:
+    saved: list[str] = []
+    sessions = {
+        robot: SimpleNamespace(idle_s=idle_s, save=lambda robot=robot: saved.append(robot))
+        for robot, (idle_s, _) in given.items()
+    }
+    inbox = SimpleNamespace(lives=lambda _, robot: set(range(given[robot][1])))
+    loop: Any = SimpleNamespace(_sessions=sessions, _inbox=inbox)
+    ActorLoop._forget_one(loop)
+    assert "".join(sessions) == left
+    assert set(saved) == set(given) - set(left)  # it goes on where it was if it comes back
+
+
+def test_a_robot_that_owes_an_episode_is_not_put_away(tmp_path: Path) -> None:
+    rig = Rig("lockstep", tmp_path)
+    rig.see(0)
+    assert rig.session.idle_s == 0.0
+    rig.session._served.heard_s -= 60.0
+    assert rig.session.idle_s >= 60.0
+    rig.session._pending = SimpleNamespace()  # type: ignore[assignment]
+    assert rig.session.idle_s == 0.0

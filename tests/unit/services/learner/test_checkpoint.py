@@ -225,3 +225,34 @@ def test_a_checkpoint_of_another_run_stays_where_it_is(written: tuple[Path, Trai
     with pytest.raises(StateError, match="run2"):
         checkpoint.take_up(path, make_trainer(), "run2/0123456789abcdef")
     assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+def test_a_kill_costs_no_turn_and_a_power_cut_those_since_the_last_sync(
+    written: tuple[Path, Trainer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, trainer = written
+    on_disk = path.read_bytes()
+    for episode in (4, 5):
+        train(trainer, range(episode, episode + 1))
+        checkpoint.keep(path, trainer, episode, IDENTITY)
+    assert path.read_bytes() == on_disk
+    files = {file.name: file.read_bytes() for file in path.parent.iterdir()}
+    with monkeypatch.context() as other:
+        other.setattr(checkpoint, "_boot", lambda: "after a power cut")
+        assert checkpoint.take_up(path, make_trainer(), IDENTITY).episode == 3
+    for name, data in files.items():
+        (path.parent / name).write_bytes(data)
+    (path.parent / f"{path.name}{checkpoint.UNSYNCED[0]}").write_bytes(b"torn")  # while 6 was
+    resumed = make_trainer()
+    assert checkpoint.take_up(path, resumed, IDENTITY).episode == 5
+    assert state(resumed) == state(trainer)
+    assert {file.name for file in path.parent.iterdir()} == {path.name, path.name + ".previous"}
+
+
+def test_without_a_checkpoint_a_state_that_was_not_synced_does_not_count(
+    written: tuple[Path, Trainer],
+) -> None:
+    path, trainer = written
+    checkpoint.keep(path, trainer, 4, IDENTITY)
+    path.unlink()
+    assert checkpoint.take_up(path, make_trainer(), IDENTITY) == Place()

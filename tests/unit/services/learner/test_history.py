@@ -106,7 +106,7 @@ class Replay:
             raise lie
         return lie or Turns(turns=self.storage.turns(request.since, request.limit))
 
-    def request_many(self, stream: Any, request: Any, *_: Any, timeout_s: float) -> Any:
+    def request_many(self, stream: Any, request: Any, *_: Any, **__: Any) -> Any:
         feed = self.storage.feed
         if stream is CHANGES:
             return feed.changes(request.since, request.upto, request.lineage)

@@ -47,7 +47,7 @@ class Memory:
             done = maintain(self._memory, now, self.config, predictor, seed=1)
             self.storage.apply_turn(pending, self._memory, done)
 
-    def request_many(self, stream: Any, request: Any, *types: Any, timeout_s: float) -> Any:
+    def request_many(self, stream: Any, request: Any, *types: Any, **_: Any) -> Any:
         """What a learner's bus gets for an answer."""
         feed = self.storage.feed
         if stream is CHANGES:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import lmdb
 import numpy as np
 import oracles
 import pytest
@@ -16,11 +19,13 @@ from builders import FakePredictor, fake_values, make_episode
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from services.learner import mirror as mirror_module
 from services.learner.mirror import Mirror, apply
 from services.replay import feed as feed_module
+from services.replay import tables as tables_module
 from services.replay.storage import Storage
 from shared.config import MemoryConfig
-from shared.errors import PeerSilent, StateError
+from shared.errors import ConfigError, DiskFull, PeerSilent, StateError
 from shared.keys import CHANGES
 from shared.messages import NO_LINEAGE, Change, Episode, FeedEnd
 from shared.rl.draws import generator
@@ -586,7 +591,7 @@ class ScriptedBus:
         self.lost: int | None = None
         """Place of a reply that does not arrive."""
 
-    def request_many(self, stream: Any, request: Any, *types: Any, timeout_s: float) -> Any:
+    def request_many(self, stream: Any, request: Any, *types: Any, **_: Any) -> Any:
         self.asked.append(stream.name)
         storage = self.bench.storage
         if stream is CHANGES:
@@ -619,6 +624,31 @@ def test_a_mirror_follows_change_by_change_and_resynchronises_after_a_gap(
         assert len(bus.asked) == 7
 
 
+def test_a_memory_of_five_million_samples_comes_over_a_slow_radio(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """At 20 Mbit/s: two hours and a half, in which the learner shows that it lives."""
+    rows, clock, beats, taken = 5_000_000, [0.0], [0.0], []
+    part_s = feed_module.PART_ROWS * 3780 * 8 / 20e6
+    some = SimpleNamespace(count=feed_module.PART_ROWS)
+    monkeypatch.setattr(mirror_module, "Change", SimpleNamespace)
+    monkeypatch.setattr(mirror_module, "_take", lambda _, part: taken.append(part.count))
+
+    class Radio:
+        def request_many(self, *_: Any, patience_s: float) -> Any:
+            while len(taken) * some.count < rows:
+                clock[0] += part_s
+                assert part_s < patience_s
+                yield some
+            yield FeedEnd(change=7, rows=sum(taken), messages=len(taken), lineage=NO_LINEAGE)
+
+    mirror, radio = Mirror(), Radio()
+    mirror.reach(radio, 7, NO_LINEAGE, lambda: beats.append(clock[0]))  # type: ignore[arg-type]
+    assert mirror.number == 7
+    assert clock[0] > 7000
+    assert max(b - a for a, b in itertools.pairwise(beats)) < 1.0
+
+
 @pytest.mark.parametrize("lost", [0, -1])
 def test_a_broken_transfer_leaves_the_mirror_at_a_complete_change(lost: int) -> None:
     with bench() as b:
@@ -640,3 +670,39 @@ def test_a_broken_transfer_leaves_the_mirror_at_a_complete_change(lost: int) -> 
             mirror.reach(any_bus, b.change, b.lineages[b.change])
         assert mirror.number == standing
         same_samples(mirror.samples, b.seen[standing])
+
+
+# ------------------------------------------------------------------------- no room
+
+
+def test_on_a_full_disk_nothing_is_lost_and_it_goes_on_when_there_is_room(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with bench() as b:
+        b.commit(make_episode(15, seed=1, images=some_images(15, 1)))
+        b.turn()
+        before = b.storage.counters()
+        with monkeypatch.context() as full:
+            full.setattr(Storage, "_write_samples", raising(lmdb.DiskError("no space left")))
+            full.setattr(tables_module.shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
+            with pytest.raises(DiskFull, match="disk full: "):
+                b.storage.commit(make_episode(15, seed=2))
+        assert b.storage.counters() == before
+        b.commit(make_episode(15, seed=2, images=some_images(15, 2)))
+        b.turn()
+        b.check()
+
+
+def raising(error: Exception) -> Any:
+    def fail(*_: Any, **__: Any) -> None:
+        raise error
+
+    return fail
+
+
+def test_without_address_space_it_says_in_one_line_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lmdb, "open", raising(lmdb.MemoryError("cannot allocate memory")))
+    with pytest.raises(ConfigError, match=r"256 GB of address space.*`ulimit -v unlimited`"):
+        Storage(tmp_path, MemoryConfig(), IDENTITY)
