@@ -26,7 +26,7 @@ from shared.errors import (
 from shared.inbox import Inbox
 from shared.keys import CLAIM_PATTERN, Peer, Stream, alive_key, check_sender, ident_in, parse_alive
 from shared.messages import Message, Refusal
-from shared.pacing import LONGEST_S, paced
+from shared.threads import LONGEST_S, paced
 from shared.zenoh_settings import encrypted, locator, opened, zenoh_config
 
 M = TypeVar("M", bound=Message)

@@ -37,10 +37,9 @@ from shared.halts.keeper import HaltKeeper
 from shared.inbox import Inbox
 from shared.keys import PING, STOP
 from shared.messages import PROTOCOL_VERSION, Ping, ServiceReply, StopService
-from shared.pacing import jittered
-from shared.stopping import StopFlag as StopFlag
-from shared.stopping import Stopped as Stopped
-from shared.stopping import failing_together
+from shared.threads import StopFlag as StopFlag
+from shared.threads import Stopped as Stopped
+from shared.threads import failing_together, jittered
 
 VERSION = "0.1.0"
 EXIT_OK, EXIT_CRASH, EXIT_CONFIG, EXIT_STATE, EXIT_ROLE = 0, 1, 2, 3, 4

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Literal, Self
 
-from shared.pacing import jittered
+from shared.threads import jittered
 
 log = logging.getLogger(__name__)
 

@@ -13,8 +13,7 @@ from shared.config import BusConfig
 from shared.errors import PeerMissing
 from shared.keys import SNAPSHOT
 from shared.messages import NO_LINEAGE, FeedEnd, SnapshotRequest
-from shared.pacing import jittered, paced
-from shared.stopping import StopFlag, Stopped, failing_together
+from shared.threads import StopFlag, Stopped, failing_together, jittered, paced
 
 
 class Feed:
