@@ -115,8 +115,15 @@ def test_the_environment_is_read(
     assert tomllib.loads(capsys.readouterr().out)["memory"]["capacity"] == 100
 
 
+def ran(folder: Path, config: Config) -> None:
+    """A folder in which a run of this configuration learnt something."""
+    settings.claim(folder, config)
+    (folder / "learner").mkdir()
+    (folder / "learner" / "checkpoint.safetensors").touch()
+
+
 def test_dedicated_options_win_over_set(capsys: pytest.CaptureFixture[str]) -> None:
-    settings.claim(Path("other"), settings.load(overrides=["run.seed=5"]))
+    ran(Path("other"), settings.load(overrides=["run.seed=5"]))
     options = ("--set", "run.seed=4", "--seed", "3", "--run-dir", "other")
     assert "run.seed is 5 there, but 3 now" in refused(capsys, 2, "up", *options)
 
@@ -124,7 +131,7 @@ def test_dedicated_options_win_over_set(capsys: pytest.CaptureFixture[str]) -> N
 def test_a_folder_of_another_configuration_is_refused_by_services_too(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    settings.claim(Path("runs/demo"), settings.load("demo"))
+    ran(Path("runs/demo"), settings.load("demo"))
     for command in ("up", "driver", "actor", "replay", "learner"):
         assert "episode.max_samples is 200 there, but 500 now" in refused(capsys, 2, command)
 
