@@ -14,8 +14,12 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 from benchmarks.waiting import wait_until
@@ -23,6 +27,8 @@ from services.launcher.up import free_endpoint
 
 ROOT = Path(__file__).parents[2]
 DEADLINE_S = 90.0
+AT_ONCE = 2
+"""Environments that are made and tried beside each other."""
 NEWER = ("3.12", "3.13")
 WITH_TORCH = {"actor", "replay", "learner", "record", "experiments", "openvino", "all"}
 """Not tried with the newer Pythons: their builds of torch would have to be downloaded."""
@@ -34,50 +40,64 @@ class Environment:
     def __init__(self, folder: Path, python: str, wheel: Path, extra: str) -> None:
         self.folder, self.bin = folder, folder / "venv" / "bin"
         self.endpoint = free_endpoint()
+        self.place = ("--run", "trial", "--endpoint", self.endpoint)
         subprocess.run([python, "-m", "venv", "--without-pip", folder / "venv"], check=True)
         pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "-qqq", "--python"]
         constraints = ["--no-compile", "--constraint", str(ROOT / "constraints.txt")]
         what = f"corridor[{extra}] @ {wheel.as_uri()}"
         subprocess.run([*pip, self.bin / "python", "install", *constraints, what], check=True)
 
-    def start(self, *words: str) -> subprocess.Popen[str]:
-        """Start a command of the environment's `corridor`."""
-        return subprocess.Popen(
+    def run(self, *words: str) -> tuple[int, str]:
+        """Run a command of the environment's `corridor`: exit code and what it said."""
+        done = subprocess.run(
             [self.bin / "corridor", *words],
             cwd=self.folder,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
+            timeout=DEADLINE_S,
+            check=False,
         )
+        return done.returncode, done.stdout
 
-    def run(self, *words: str) -> tuple[int, str]:
-        """Run a command to its end: exit code and what it said."""
-        with self.start(*words) as process:
-            said, _ = process.communicate(timeout=DEADLINE_S)
-        return process.returncode, said
+    @contextmanager
+    def running(self, *words: str, until: Callable[[], bool]) -> Iterator[None]:
+        """Run a command beside a router until something holds, and stop it.
 
-    def starts(self, service: str, *options: str) -> None:
-        """A service announces itself at a router, and ends cleanly. Raises AssertionError."""
-        router = self.start("router", "--listen", self.endpoint)
-        process = self.start(service, "--endpoint", self.endpoint, *options)
-        try:
-            look = ("status", "--endpoint", self.endpoint, "--require", service)
-            wait_until(
-                lambda: self.run(*look)[0] == 0 or process.poll() is not None,
-                DEADLINE_S,
-                f"{service} answers",
-            )
-            assert process.poll() is None, process.communicate()[0]
+        Raises AssertionError if it ends earlier, or not cleanly.
+        """
+        outputs = [self.folder / f"{name}.out" for name in ("router", words[0])]
+        commands = [("router", "--listen", self.endpoint), (*words, *self.place)]
+        with ExitStack() as stack:
+            children = []
+            for output, command in zip(outputs, commands, strict=True):
+                stream = stack.enter_context(output.open("w"))
+                child = subprocess.Popen(
+                    [self.bin / "corridor", *command],
+                    cwd=self.folder,
+                    stdout=stream,
+                    stderr=subprocess.STDOUT,
+                )
+                stack.callback(child.wait, DEADLINE_S)
+                stack.callback(child.kill)
+                children.append(child)
+            process = children[1]
+            wait_until(lambda: until() or process.poll() is not None, DEADLINE_S, words[0])
+            assert process.poll() is None, outputs[1].read_text()
+            yield
             process.send_signal(signal.SIGTERM)
-            assert process.wait(DEADLINE_S) == 0, process.communicate()[0]
-        finally:
-            for child in (process, router):
-                child.kill()
-                child.communicate()
+            assert process.wait(DEADLINE_S) == 0, outputs[1].read_text()
 
 
 def _service(name: str, *options: str) -> Callable[[Environment], None]:
-    return lambda environment: environment.starts(name, *options)
+    """A service announces itself at a router, and ends cleanly."""
+
+    def check(environment: Environment) -> None:
+        look = ("status", *environment.place, "--require", name)
+        with environment.running(name, *options, until=lambda: environment.run(*look)[0] == 0):
+            pass
+
+    return check
 
 
 def _command(*words: str) -> Callable[[Environment], None]:
@@ -97,35 +117,43 @@ def _without_services(environment: Environment) -> None:
 
 
 def _record(environment: Environment) -> None:
-    router = environment.start("router", "--listen", environment.endpoint)
-    place = ("--endpoint", environment.endpoint)
     (environment.folder / "config.toml").write_text(environment.run("config")[1])
-    process = environment.start("record", "--out", "a.mcap", "--config", "config.toml", *place)
-    try:
-        file = environment.folder / "a.mcap"
-        wait_until(lambda: file.exists() or process.poll() is not None, DEADLINE_S, "a recording")
-        assert process.poll() is None, process.communicate()[0]
-        process.send_signal(signal.SIGINT)
-        assert process.wait(DEADLINE_S) == 0, process.communicate()[0]
-    finally:
-        for child in (process, router):
-            child.kill()
-            child.communicate()
+    file = environment.folder / "a.mcap"
+    words = ("record", "--out", "a.mcap", "--config", "config.toml")
+    with environment.running(*words, until=file.exists):
+        pass
 
 
-UNREACHABLE = "127.0.0.1:9"
+class _Silent(BaseHTTPRequestHandler):
+    def log_message(self, form: str, *args: object) -> None:
+        """Say nothing."""
+
+
+def _robotino(environment: Environment) -> None:
+    """Its driver starts in front of a server that answers, and knows nothing that it is asked."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), _Silent) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        address = f"robot.robotino.address=127.0.0.1:{server.server_port}"
+        _service("driver", "--preset", "robotino", "--set", address)(environment)
+        server.shutdown()
+
+
+def _ros2(environment: Environment) -> None:
+    """Its driver starts in a network without a robot."""
+    network = f"robot.ros2.endpoint={environment.endpoint}"
+    _service("driver", "--preset", "turtlebot4", "--set", network)(environment)
+
+
 PURPOSES: dict[str, Callable[[Environment], None]] = {
     "driver": _without_services,
     "sim": _service("driver"),
-    "robotino": _service(
-        "driver", "--preset", "robotino", "--set", f"robot.robotino.address={UNREACHABLE}"
-    ),
-    "ros2": _command("driver", "--help"),
+    "robotino": _robotino,
+    "ros2": _ros2,
     "record": _record,
     "actor": _service("actor"),
     "replay": _service("replay"),
     "learner": _service("learner"),
-    "secure": _command("secure", "init", "--folder", "secure"),
+    "secure": _command("secure", "init", "secure"),
     "experiments": _command("experiment", "--describe", "plus-rmm"),
     "all": _command("doctor"),
 }
@@ -137,9 +165,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("extras", nargs="*", choices=[[], *PURPOSES])
     chosen = parser.parse_args(arguments).extras or list(PURPOSES)
-    failed = 0
-    with tempfile.TemporaryDirectory() as place:
+    with tempfile.TemporaryDirectory() as place, ThreadPoolExecutor(AT_ONCE) as pool:
         wheel = _wheel(Path(place))
+        tries = []
         for version, python in (("3.11", sys.executable), *((v, _python(v)) for v in NEWER)):
             if not python:
                 print(f"Python {version}: NOT TRIED, there is none at hand")
@@ -147,9 +175,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for extra in chosen:
                 if version != "3.11" and (extra in WITH_TORCH or extra == "sim"):
                     continue
-                failed += not _try(
-                    Path(place) / f"{version}-{extra}", version, python, wheel, extra
-                )
+                folder = Path(place) / f"{version}-{extra}"
+                tries.append(pool.submit(_try, folder, version, python, wheel, extra))
+        failed = sum(not each.result() for each in tries)
         print(
             f"Python {', '.join(NEWER)}: NOT TRIED are sim (pybullet has no wheels there) and "
             f"{', '.join(sorted(WITH_TORCH))} (their builds of torch are not at hand)"
