@@ -181,6 +181,10 @@ class ReplayMemory(SampleStore):
             raise ValueError(f"capacity: expected at least 1, got {capacity}")
         self.capacity = capacity
 
+    def world_indices(self, names: Sequence[str]) -> npt.NDArray[np.uint16]:
+        """Return the indices of world names in `worlds`, which grows as needed."""
+        return world_indices(self.worlds, names)
+
     def check_valid(self) -> None:
         """Raise AssertionError naming the first invariant that does not hold."""
         super().check_valid()

@@ -13,7 +13,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_stat
 
 from shared.config import MemoryConfig
 from shared.facts import IMAGE_SHAPE
-from shared.rl.memory import SAMPLE, ReplayMemory, world_indices
+from shared.rl.memory import SAMPLE, ReplayMemory
 from shared.rl.retention.strategy import Situation, discard
 from shared.rl.retention.table import STRATEGIES
 
@@ -95,7 +95,7 @@ class Memories(RuleBasedStateMachine):
         for i, (action, shows, tenths, world) in enumerate(new):
             front = bytes([shows] * 15)
             rows[i]["id"], rows[i]["action"], rows[i]["reward"] = first + i, action, tenths / 10
-            rows[i]["world"] = world_indices(memory.worlds, [world])[0]
+            rows[i]["world"] = memory.world_indices([world])[0]
             rows[i]["x_m"], rows[i]["episode"] = shows, self.episode
             images[i] = np.frombuffer(image_with(front), np.uint8).reshape(IMAGE_SHAPE)
             self.given[first + i] = (action, tenths, world, front)
@@ -137,12 +137,12 @@ def shares_after_minus(name: str, seed: int) -> float:
         rows = np.zeros(part, SAMPLE)
         rows["id"] = number * part + 1 + np.arange(part)
         rows["action"] = draw.integers(0, 3, part)
-        rows["world"] = world_indices(memory.worlds, [WORLDS[number * part >= PLUS * CAPACITY]])[0]
+        rows["world"] = memory.world_indices([WORLDS[number * part >= PLUS * CAPACITY]])[0]
         images = np.zeros((part, *IMAGE_SHAPE), np.uint8)
         images.reshape(part, -1)[:, :15] = draw.integers(0, 256, (part, 15), np.uint8)
         memory.append(rows, images)
         discard(Situation(memory, number + 1, config, network, seed=seed))
-    return float(np.mean(memory.rows["world"] == world_indices(memory.worlds, ["plus"])[0]))
+    return float(np.mean(memory.rows["world"] == memory.world_indices(["plus"])[0]))
 
 
 @pytest.mark.parametrize(

@@ -61,6 +61,11 @@ class EmulatedRos2:
         ConfigError: It cannot listen there, or there is no such world.
     """
 
+    faults: Ros2Faults
+    """What is wrong now."""
+    endpoint: str
+    """Where it listens."""
+
     def __init__(self, config: RobotConfig, world: str, listen: str, faults: Ros2Faults) -> None:
         self._ros = config.ros2
         create3 = self._ros.bumper_type == "HazardDetectionVector"
@@ -76,7 +81,6 @@ class EmulatedRos2:
         self.counts: Counter[str] = Counter()
         """Commands that came, and those refused, by why."""
         self.faults = Ros2Faults()
-        """What is wrong now."""
         self._lock = threading.RLock()
         self._inbox = RawInbox()
         self._network: Network | None = None
@@ -89,7 +93,6 @@ class EmulatedRos2:
         self._last_command_ns = 0
         try:
             self.endpoint = listen
-            """Where it listens."""
             self._network = self._opened()
             self.endpoint = self._network.endpoint
         except BaseException:

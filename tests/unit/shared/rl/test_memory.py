@@ -22,7 +22,7 @@ from hypothesis.stateful import (
 
 from shared.config import MemoryConfig
 from shared.rl import memory as memory_module
-from shared.rl.memory import MIRROR, SAMPLE, ReplayMemory, SampleStore, world_indices
+from shared.rl.memory import MIRROR, SAMPLE, ReplayMemory, SampleStore
 from shared.rl.retention.rmm import candidates_by_action, force_candidates
 from shared.rl.schedule import Moment
 from shared.rl.turn import maintain
@@ -74,7 +74,7 @@ class MemoryMachine(RuleBasedStateMachine):
                 bytes(14) + bytes([(1 << kind) - 1]) + self.next_id.to_bytes(4, "big")
             )
             row["id"], row["action"], row["reward"] = self.next_id, action, reward / 4
-            row["world"] = world_indices(self.memory.worlds, [world])[0]
+            row["world"] = self.memory.world_indices([world])[0]
             row["episode"] = self.version
             images.append(image)
             self.model.append(

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from shared.config import MemoryConfig
 from shared.rl.draws import generator
-from shared.rl.memory import ReplayMemory, world_indices
+from shared.rl.memory import ReplayMemory
 from shared.rl.retention.most_alike import (
     COVERAGE_POSE,
     FAR,
@@ -117,7 +117,7 @@ def test_coverage_of_poses_removes_the_older_of_the_nearest(
 ) -> None:
     n = len(given_poses)
     memory = memory_of([bytes(1)] * n)
-    world_indices(memory.worlds, ["minus"])
+    memory.world_indices(["minus"])
     for row, pose in zip(memory.rows, given_poses, strict=True):
         row["world"], row["x_m"], row["y_m"], row["heading_rad"] = pose
 
@@ -138,7 +138,7 @@ def test_coverage_of_poses_removes_the_older_of_the_nearest(
 
 def test_other_worlds_are_never_near() -> None:
     memory = memory_of([bytes(1)] * 31)
-    world_indices(memory.worlds, ["minus"])
+    memory.world_indices(["minus"])
     memory.rows["x_m"] = 10.0 * np.arange(31)
     memory.rows["x_m"][[0, 1]], memory.rows["world"][0] = 5.0, 1
     memory.rows["x_m"][[20, 21]] = 200.0, 209.0
