@@ -18,7 +18,7 @@ import numpy as np
 from experiments.environment import LIFE, CorridorEnv
 from services.actor.actor import Actor
 from services.replay import numbering
-from services.replay.numbering import Commit, Counters
+from services.replay.numbering import Counters
 from services.robot_driver.simulated.sim import SimRobot
 from shared.config import Config
 from shared.messages import Episode, Observation, RobotProgress
@@ -27,7 +27,7 @@ from shared.rl.memory import ReplayMemory
 from shared.rl.network import to_bytes
 from shared.rl.predictor import Predictor
 from shared.rl.schedule import Moment
-from shared.rl.turn import Maintenance, maintain, sample_rows
+from shared.rl.turn import Commit, Maintenance, maintain, sample_rows
 
 
 @dataclass(frozen=True)

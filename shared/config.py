@@ -43,6 +43,13 @@ class Section(BaseModel):
     )
 
 
+def _at_most(section: Section, name: str, lower: str, upper: str) -> None:
+    """Raise ValueError where one setting of a section exceeds another."""
+    low, high = getattr(section, lower), getattr(section, upper)
+    if low > high:
+        raise ValueError(f"{name}.{lower} ({low}) must not exceed {name}.{upper} ({high})")
+
+
 class RunConfig(Section):
     """Which run this is."""
 
@@ -227,24 +234,13 @@ class RobotConfig(Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if self.speed_m_s > self.max_speed_m_s:
-            raise ValueError(
-                f"robot.speed_m_s ({self.speed_m_s}) must not exceed robot.max_speed_m_s "
-                f"({self.max_speed_m_s})"
-            )
-        if self.turn_rad_s > self.max_turn_rad_s:
-            raise ValueError(
-                f"robot.turn_rad_s ({self.turn_rad_s}) must not exceed robot.max_turn_rad_s "
-                f"({self.max_turn_rad_s})"
-            )
-        if self.kind != "sim" and self.timing != "realtime":
-            raise ValueError(
-                f"robot.kind '{self.kind}' needs robot.timing 'realtime', got '{self.timing}'"
-            )
-        if self.kind != "sim" and self.recovery != "back-off":
-            raise ValueError(
-                f"robot.kind '{self.kind}' needs robot.recovery 'back-off', got '{self.recovery}'"
-            )
+        _at_most(self, "robot", "speed_m_s", "max_speed_m_s")
+        _at_most(self, "robot", "turn_rad_s", "max_turn_rad_s")
+        for key, needed in (("timing", "realtime"), ("recovery", "back-off")):
+            if self.kind != "sim" and (given := getattr(self, key)) != needed:
+                raise ValueError(
+                    f"robot.kind '{self.kind}' needs robot.{key} '{needed}', got '{given}'"
+                )
         if self.deadman_s < self.period_s:
             raise ValueError(
                 f"robot.deadman_s ({self.deadman_s}) must be at least one robot.period_s "
@@ -349,11 +345,7 @@ class MemoryConfig(Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if self.threshold_percent > self.threshold_max_percent:
-            raise ValueError(
-                f"memory.threshold_percent ({self.threshold_percent}) must not exceed "
-                f"memory.threshold_max_percent ({self.threshold_max_percent})"
-            )
+        _at_most(self, "memory", "threshold_percent", "threshold_max_percent")
         if 0 < self.capacity_max < self.capacity:
             raise ValueError(
                 f"memory.capacity_max ({self.capacity_max}) must be 0 or at least "
@@ -498,8 +490,8 @@ class Config(Section):
         """The tree as plain nested dictionaries."""
         return self.model_dump(mode="json")
 
-    def fingerprint(self) -> str:
-        """16 hex digits over everything that must agree between services that work together.
+    def binding(self) -> dict[str, Any]:
+        """The part of the tree that must agree between services that work together.
 
         Where the router is, how long the run goes on, which robots an actor serves, which robot a
         driver drives and how it reaches it may differ.
@@ -508,5 +500,9 @@ class Config(Section):
         del tree["bus"], tree["run"]["episodes"], tree["run"]["robots"]
         for key in DRIVER_ONLY:
             del tree["robot"][key]
-        text = json.dumps(tree, sort_keys=True, separators=(",", ":"))
+        return tree
+
+    def fingerprint(self) -> str:
+        """16 hex digits over `binding`."""
+        text = json.dumps(self.binding(), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:16]

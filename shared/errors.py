@@ -30,13 +30,20 @@ LONGEST_PLACE = 100
 class CorridorError(Exception):
     """Base of all errors this project raises on purpose."""
 
+    exit_code = 1
+    """Of the program that it ends."""
+
 
 class ConfigError(CorridorError):
     """A configuration that cannot work, told in one line: key, expected, got, where from."""
 
+    exit_code = 2
+
 
 class StateError(CorridorError):
     """State on disk that does not belong to this run or is damaged."""
+
+    exit_code = 3
 
 
 class DiskFull(CorridorError, OSError):
@@ -45,6 +52,8 @@ class DiskFull(CorridorError, OSError):
 
 class RoleTaken(CorridorError):
     """Another process has the role that this one wants; the text names it."""
+
+    exit_code = 4
 
 
 class RobotMissing(CorridorError):

@@ -24,7 +24,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from shared.config import Config, Numerics
-from shared.errors import ConfigError, StateError
+from shared.errors import ConfigError, StateError, first_problem
 from shared.facts import IMAGE_SHAPE
 from shared.settings import read_folder
 from shared.statefile import create
@@ -49,20 +49,28 @@ def settle(config: Config, folder: Path, role: Role, common: Path | None = None)
 
     Raises StateError when the stored ones are damaged, ConfigError when they name what is missing.
     """
+    if (found := known(config, folder, role)) is not None:
+        return _installed(found)
     wanted: Numerics = getattr(config.numerics, role)
-    if wanted.settled:
-        return _installed(wanted)
-    path = _path(folder, role)
-    if path.exists():
-        try:
-            return _installed(type(wanted).model_validate(json.loads(path.read_text())))
-        except ValidationError as error:
-            raise StateError(f"{path}: damaged: {error.errors()[0]['msg']}") from error
-        except ValueError as error:
-            raise StateError(f"{path}: damaged: {error}") from error
     chosen = settle(config, common, role) if common else choose(config, wanted, role)
-    create(path, (json.dumps(chosen.model_dump(), indent=1) + "\n").encode())
+    create(_path(folder, role), (json.dumps(chosen.model_dump(), indent=1) + "\n").encode())
     return settle(config, folder, role)  # another process may have been faster
+
+
+def known(config: Config, folder: Path, role: Role) -> Numerics | None:
+    """The settled numerics of one role in this run folder; None before they are chosen.
+
+    Raises StateError when the stored ones are damaged.
+    """
+    wanted: Numerics = getattr(config.numerics, role)
+    path = _path(folder, role)
+    if wanted.settled or not path.exists():
+        return wanted if wanted.settled else None
+    try:
+        return type(wanted).model_validate(json.loads(path.read_text()))
+    except (OSError, ValueError) as error:
+        text = first_problem(error) if isinstance(error, ValidationError) else error
+        raise StateError(f"{path}: damaged: {text}") from error
 
 
 def settle_all(config: Config, folder: Path, roles: Sequence[Role] = ROLES) -> None:

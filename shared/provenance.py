@@ -26,7 +26,7 @@ def machine() -> dict[str, str]:
         "cpu": _processor(),
         "cores": str(len(os.sched_getaffinity(0))),
         "python": platform.python_version(),
-        "torch": _torch(),
+        "torch": version_of("torch"),
         "commit": commit(),
     }
 
@@ -34,7 +34,7 @@ def machine() -> dict[str, str]:
 def machine_key(config: Config) -> str:
     """8 hex digits over what decides which arithmetic is the fastest one."""
     decides = {
-        "machine": [_processor(), len(os.sched_getaffinity(0)), _torch()],
+        "machine": [_processor(), len(os.sched_getaffinity(0)), version_of("torch")],
         "network": config.network.model_dump(mode="json"),
         "numerics": config.numerics.model_dump(mode="json"),
         "learning": [config.learning.batch_size, config.learning.mode],
@@ -56,10 +56,10 @@ def commit() -> str:
     return said("rev-parse", "--short", "HEAD") + ("+" if changed else "")
 
 
-def _torch() -> str:
+def version_of(package: str) -> str:
     """The version that is installed, found without importing it; empty where there is none."""
     try:
-        return metadata.version("torch")
+        return metadata.version(package)
     except metadata.PackageNotFoundError:
         return ""
 

@@ -31,7 +31,6 @@ from shared.errors import (
     RobotMissing,
     RoleTaken,
     RouterMissing,
-    StateError,
 )
 from shared.halts.keeper import HaltKeeper
 from shared.inbox import Inbox
@@ -42,7 +41,7 @@ from shared.threads import Stopped as Stopped
 from shared.threads import failing_together, jittered
 
 VERSION = "0.1.0"
-EXIT_OK, EXIT_CRASH, EXIT_CONFIG, EXIT_STATE, EXIT_ROLE = 0, 1, 2, 3, 4
+EXIT_OK, EXIT_CRASH = 0, 1
 REJOIN_S = 10.0
 """After a sleep longer than its lease a process looks so long whether its role was taken."""
 SETTLE_S = 3.0
@@ -295,16 +294,10 @@ def guarded(name: str, main: Callable[[], None]) -> int:
         main()
     except Stopped:
         return EXIT_OK
-    except (ConfigError, StateError, RoleTaken) as error:
-        log.error("%s", error)
-        codes = {ConfigError: EXIT_CONFIG, StateError: EXIT_STATE, RoleTaken: EXIT_ROLE}
-        return codes[type(error)]
-    except (RobotMissing, DiskFull) as error:
-        log.error("%s", error)
-        return EXIT_CRASH
-    except CorridorError:
-        log.exception("%s failed", name)
-        return EXIT_CRASH
+    except CorridorError as error:
+        told = isinstance(error, RobotMissing | DiskFull) or error.exit_code != EXIT_CRASH
+        log.error("%s", error, exc_info=not told)
+        return error.exit_code
     except Exception:  # the only place: say what happened, then let the supervisor restart us
         log.exception("%s crashed", name)
         return EXIT_CRASH

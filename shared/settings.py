@@ -20,7 +20,7 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
-from shared.config import DRIVER_ONLY, Config, Section
+from shared.config import Config, Section
 from shared.errors import ConfigError, StateError
 from shared.place import is_up
 from shared.statefile import create, write_atomically
@@ -110,8 +110,12 @@ def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def differences(old: Config, new: Config) -> list[tuple[str, Any, Any]]:
     """All keys in which two configurations differ: key, old value, new value."""
-    after = flatten(new.to_dict())
-    return [(k, v, after[k]) for k, v in flatten(old.to_dict()).items() if v != after[k]]
+    return _differences(old.to_dict(), new.to_dict())
+
+
+def _differences(old: Tree, new: Tree) -> list[tuple[str, Any, Any]]:
+    after = flatten(new)
+    return [(k, v, after[k]) for k, v in flatten(old).items() if v != after[k]]
 
 
 def toml_value(value: bool | int | float | str) -> str:
@@ -126,15 +130,19 @@ def to_toml(config: Config) -> str:
     return _toml(config.to_dict())
 
 
+def _put(tree: Tree, key: str, value: Any) -> None:
+    """Set a dotted key of nested tables."""
+    *path, name = key.split(".")
+    for chunk in path:
+        tree = tree.setdefault(chunk, {})
+    tree[name] = value
+
+
 def preset_text(config: Config) -> str:
     """What differs from the defaults as TOML, as a preset has it."""
     tree: Tree = {}
     for key, _, value in differences(Config(), config):
-        *path, name = key.split(".")
-        table = tree
-        for chunk in path:
-            table = table.setdefault(chunk, {})
-        table[name] = value
+        _put(tree, key, value)
     return _toml(tree)
 
 
@@ -189,7 +197,7 @@ def claim(folder: Path, config: Config) -> Config:
         write(config, path)
         return config
     if stored.fingerprint() != config.fingerprint():
-        name, old, new = _first_binding_difference(stored, config)
+        name, old, new = _differences(stored.binding(), config.binding())[0]
         raise ConfigError(
             f"run folder {folder} belongs to another configuration: {name} is {toml_value(old)} "
             f"there, but {toml_value(new)} now; use another run name (--run) or folder (--run-dir)"
@@ -223,21 +231,6 @@ def _resolved(config: Config) -> bytes:
     return (header + to_toml(config)).encode()
 
 
-def _first_binding_difference(stored: Config, config: Config) -> tuple[str, Any, Any]:
-    """The first difference that changes the fingerprint."""
-    different = differences(stored, config)
-    binding = (d for d in different if _binds(d[0]))
-    return next(binding, different[0])
-
-
-def _binds(key: str) -> bool:
-    """Whether a setting is part of the fingerprint."""
-    section, _, rest = key.partition(".")
-    driver_only = section == "robot" and rest.partition(".")[0] in DRIVER_ONLY
-    own = key in ("run.episodes", "run.robots")
-    return not (section == "bus" or own or driver_only)
-
-
 class _Merged:
     """Values of all sources so far, and where each came from."""
 
@@ -265,11 +258,7 @@ class _Merged:
     def _set(self, key: str, value: Any, source: str) -> None:
         if key not in self.fields:
             raise ConfigError(f"{self._unknown(key)} ({source})")
-        *path, name = key.split(".")
-        table = self.values
-        for chunk in path:
-            table = table.setdefault(chunk, {})
-        table[name] = value
+        _put(self.values, key, value)
         self.sources[key] = source
 
     def _unknown(self, key: str) -> str:

@@ -86,10 +86,17 @@ def read(path: Path) -> dict[str, Any] | None:
     Returns None when there is no file. Raises StateError when it is damaged; it is set aside then.
     """
     try:
-        data = _bytes(path)
-        return None if data is None else _values(path, data)
-    except StateError as error:
-        raise StateError(f"{error}; it lies at {set_aside(path)} now") from error
+        if path.stat().st_size > LIMIT_BYTES:
+            raise ValueError(f"expected at most {LIMIT_BYTES} bytes")
+        state = msgpack.unpackb(path.read_bytes())
+        if not isinstance(state, dict):
+            raise ValueError("not a map")
+        return state
+    except FileNotFoundError:
+        return None
+    except (ValueError, msgpack.UnpackException) as error:
+        aside = set_aside(path)
+        raise StateError(f"{path}: damaged saved state: {error}; it lies at {aside} now") from error
 
 
 def set_aside(path: Path) -> Path:
@@ -104,15 +111,6 @@ def set_aside(path: Path) -> Path:
     return aside
 
 
-def _bytes(path: Path) -> bytes | None:
-    try:
-        if path.stat().st_size > LIMIT_BYTES:
-            raise StateError(f"{path}: expected at most {LIMIT_BYTES} bytes of saved state")
-        return path.read_bytes()
-    except FileNotFoundError:
-        return None
-
-
 def sync(folder: Path) -> None:
     """Bring what was renamed or removed in a folder to disk."""
     directory = os.open(folder, os.O_RDONLY)
@@ -120,13 +118,3 @@ def sync(folder: Path) -> None:
         os.fsync(directory)
     finally:
         os.close(directory)
-
-
-def _values(path: Path, data: bytes) -> dict[str, Any]:
-    try:
-        state = msgpack.unpackb(data)
-    except (ValueError, msgpack.UnpackException) as error:
-        raise StateError(f"{path}: damaged saved state: {error}") from error
-    if not isinstance(state, dict):
-        raise StateError(f"{path}: damaged saved state: not a map")
-    return state

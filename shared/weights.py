@@ -105,7 +105,8 @@ class WeightsFetcher(threading.Thread):
         self._inbox.subscribe(LEARNER_STATE, "main")
         self._inbox.watch("learner", "main")
         self._newer = threading.Condition()
-        self._newest: tuple[int, bytes] = (0, b"")
+        self.newest: tuple[int, bytes] = (0, b"")
+        """Version and safetensors bytes; version 0 before anything came."""
         self._wanted = Wanted()
         self._silent = False
         """The router has chosen somebody who does not answer, such as a learner that is gone."""
@@ -117,33 +118,28 @@ class WeightsFetcher(threading.Thread):
         me.stop.on_set(self._inbox.wake)
         self.start()
 
-    @property
-    def newest(self) -> tuple[int, bytes]:
-        """Version and safetensors bytes; version 0 before anything came."""
-        return self._newest
-
     def wait_for(self, least: int) -> tuple[int, bytes]:
         """The newest weights, as soon as their version is at least this. Raises Stopped."""
         with self._newer:
-            while self._newest[0] < least:
+            while self.newest[0] < least:
                 if self._me.stop.is_set():
                     raise Stopped("waiting for weights")
                 self._newer.wait(TICK_S)
-        return self._newest
+        return self.newest
 
     def run(self) -> None:
         """Fetch whatever the learner announces, until the service stops."""
         wanted = self._wanted
         while not self._me.stop.is_set():
             waiting_s = wanted.due_s(time.monotonic())
-            if wanted.version <= self._newest[0] or waiting_s:
+            if wanted.version <= self.newest[0] or waiting_s:
                 self._inbox.wait(min(waiting_s or TICK_S, TICK_S))
             for _, state in self._inbox.take(LEARNER_STATE, LearnerState):
                 lives = self._inbox.lives("learner", "main")
                 if not lives or state.life in lives:
                     wanted.note(state.weights_version)
                     self.heard = (state.weights_version, time.monotonic())
-            if wanted.version > self._newest[0] and not wanted.due_s(time.monotonic()):
+            if wanted.version > self.newest[0] and not wanted.due_s(time.monotonic()):
                 self._fetch()
 
     def _fetch(self) -> None:
@@ -161,12 +157,12 @@ class WeightsFetcher(threading.Thread):
             self._wanted.missed(time.monotonic(), answered=True)
             self._complaints.tell("refused", f"weights refused, the older ones stay: {error}")
             return
-        if self._newest[0] < version <= self._wanted.version + 1:  # it may be about to tell
+        if self.newest[0] < version <= self._wanted.version + 1:  # it may be about to tell
             with self._newer:
-                self._newest = (version, data)
+                self.newest = (version, data)
                 self._newer.notify_all()
             self._notify()
-        if self._wanted.version > self._newest[0] and self._wanted.missed(
+        if self._wanted.version > self.newest[0] and self._wanted.missed(
             time.monotonic(), answered=True
         ):
             told = f"weights version {self._wanted.version} is announced, but {version} is served"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from contextlib import AbstractContextManager, ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,16 +12,11 @@ import typer
 
 from services.cli.options import (
     ConfigOption,
-    CredentialsOption,
-    EndpointOption,
-    PresetOption,
-    RunDirOption,
-    RunOption,
-    SetOption,
+    Sources,
+    Which,
     default_folder,
+    grouped,
     import_installed,
-    load,
-    reach,
 )
 from services.security.use import using
 
@@ -39,11 +35,13 @@ OneRobot = Annotated[
 def add_to(app: typer.Typer) -> None:
     """Add the commands."""
     for command in (drive, teleop, record, playback):
-        app.command()(command)
+        app.command()(grouped(command))
     app.command("bundle")(pack)
 
 
 def drive(
+    which: Which,
+    sources: Sources,
     network: Annotated[
         Path,
         typer.Argument(
@@ -53,13 +51,6 @@ def drive(
     ],
     robot: OneRobot = None,
     actions: Annotated[int, typer.Option(min=0, help="Stop after so many; 0: never.")] = 0,
-    run: RunOption = None,
-    run_dir: RunDirOption = None,
-    endpoint: EndpointOption = None,
-    credentials: CredentialsOption = None,
-    preset: PresetOption = None,
-    config: ConfigOption = None,
-    set_: SetOption = None,
 ) -> None:
     """Let a frozen network drive a robot: nothing is learnt, nothing is stored.
 
@@ -72,30 +63,26 @@ def drive(
     command = import_installed("services.commander.drive", "actor")
     found, made = bundle.look(network)
     with ExitStack() as stack:
-        if made is None or _joins(preset, run or run_dir or endpoint):
-            there = reach(run, run_dir, endpoint, credentials, *DRIVING)
+        if made is None or _joins(sources.preset, which.run or which.run_dir or which.endpoint):
+            there = which.reach(*DRIVING)
         else:
-            there = stack.enter_context(_alone(found.path, made, preset, config, set_, run))
-        file = config or bundle.frozen.configuration_of(network)
-        shape = made.network if made else load(None, file, set_).network
+            there = stack.enter_context(_alone(found.path, made, sources, which.run))
+        file = sources.config or bundle.frozen.configuration_of(network)
+        shape = made.network if made else Sources(None, file, sources.set_).load().network
         predictor = found.predictor(shape)
         raise typer.Exit(command.run(there, predictor, found.path, robot, actions, typer.echo))
 
 
 def _alone(
-    file: Path,
-    made: Bundle,
-    preset: str | None,
-    config: Path | None,
-    sets: list[str] | None,
-    run: str | None,
+    file: Path, made: Bundle, sources: Sources, run: str | None
 ) -> AbstractContextManager[Config]:
     """A robot of its own for a bundle."""
     from services.commander import bundle
     from services.launcher.alone import alone
 
-    base = [] if preset or config else bundle.overrides(made)
-    own = load(preset, config, [*base, *(sets or [])], run or "drive")
+    base = [] if sources.preset or sources.config else bundle.overrides(made)
+    settings = replace(sources, set_=[*base, *(sources.set_ or [])])
+    own = settings.load({"run.name": run or "drive"})
     bundle.refuse_misfit(file, made, own.robot)
     return alone(own, default_folder(own))
 
@@ -122,13 +109,7 @@ def pack(
     typer.echo(f"{out}: {origin}")
 
 
-def teleop(
-    robot: OneRobot = None,
-    run: RunOption = None,
-    run_dir: RunDirOption = None,
-    endpoint: EndpointOption = None,
-    credentials: CredentialsOption = None,
-) -> None:
+def teleop(which: Which, robot: OneRobot = None) -> None:
     """Place a robot by keys: w a s d or arrows, space stops, e is the emergency stop, q quits.
 
     It moves only while keys keep coming, slowly, within all limits of its driver, and only when no
@@ -136,36 +117,31 @@ def teleop(
     """
     from services.commander import teleop as command
 
-    there = reach(run, run_dir, endpoint, credentials, *DRIVING)
-    raise typer.Exit(command.run(there, robot, typer.echo))
+    raise typer.Exit(command.run(which.reach(*DRIVING), robot, typer.echo))
 
 
 def record(
+    which: Which,
     out: Annotated[Path, typer.Option(help="File to write, such as drive.mcap.")],
     limit_mib: Annotated[
         int, typer.Option(min=1, max=1_000_000, help="End when the file is as large.")
     ] = 4096,
-    run: RunOption = None,
-    run_dir: RunDirOption = None,
-    endpoint: EndpointOption = None,
-    credentials: CredentialsOption = None,
     config: ConfigOption = None,
 ) -> None:
     """Record what a run publishes and its weights as MCAP, until Ctrl-C.
 
     The configuration is that of the run's folder; --config stands in for it on another machine.
     """
+    kinds = ("watcher", "operator")
     if config:
-        loaded = load(None, config, None, run, None, endpoint, credentials)
-        loaded = using(loaded, "watcher", "operator")
+        loaded = using(Sources(config=config).load(which.settings), *kinds)
     else:
-        loaded = reach(run, run_dir, endpoint, credentials, "watcher", "operator")
-    folder = run_dir or Path("runs") / loaded.run.name
+        loaded = which.reach(*kinds)
     service = import_installed("services.recorder.service", "record")
     from shared.service import setup_logging
 
     setup_logging("recorder", None)
-    raise typer.Exit(service.run(loaded, folder, out, limit_mib, typer.echo))
+    raise typer.Exit(service.run(loaded, which.folder(loaded), out, limit_mib, typer.echo))
 
 
 def playback(

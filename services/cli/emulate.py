@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from services.cli.options import (
-    ConfigOption,
-    PresetOption,
-    SetOption,
-    TetheredOption,
-    import_installed,
-    load,
-)
+from services.cli.options import Sources, TetheredOption, grouped, import_installed
 from services.launcher.tether import tether
 from shared.errors import ConfigError
 
@@ -24,9 +17,18 @@ emulate = typer.Typer(
 World = Annotated[str, typer.Option(help="World that the robot drives in, such as plus.")]
 
 
-@emulate.callback()
-def _emulate() -> None:
-    """Be a real robot's network interface in front of a simulated world."""
+def _faults_option(example: str, later: str) -> Any:
+    """The option `--fault`, repeatable. later: how faults are changed while the robot runs."""
+    told = f"A fault from the start, such as camera=frozen or {example}; repeatable. "
+    return typer.Option(metavar="NAME=VALUE", help=f"{told}While it runs: {later}.")
+
+
+def _given(sound: Any, texts: list[str] | None) -> Any:
+    """These faults of a robot. Raises ConfigError."""
+    try:
+        return sound.with_texts(texts or [])
+    except ValueError as error:
+        raise ConfigError(f"--fault: {error}") from error
 
 
 @emulate.command("robotino")
@@ -36,12 +38,7 @@ def emulate_robotino(
         str, typer.Option(help="host:port; port 0 takes a free one.")
     ] = "127.0.0.1:8080",
     fault: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=VALUE",
-            help="A fault from the start, such as camera=frozen or network=cut; repeatable. "
-            "While it runs: POST /emulator/faults.",
-        ),
+        list[str] | None, _faults_option("network=cut", "POST /emulator/faults")
     ] = None,
     tethered: TetheredOption = False,
 ) -> None:
@@ -52,15 +49,14 @@ def emulate_robotino(
     if tethered:
         tether()
     emulator = import_installed("services.robot_driver.emulation.robotino", "sim")
-    try:
-        faults = emulator.Faults().with_texts(fault or [])
-    except ValueError as error:
-        raise ConfigError(f"--fault: {error}") from error
+    faults = _given(emulator.Faults(), fault)
     emulator.run(world, listen, faults, typer.echo)
 
 
 @emulate.command("ros2")
+@grouped
 def emulate_ros2(
+    sources: Sources,
     transport: Annotated[
         str | None,
         typer.Option(metavar="bridge|rmw-zenoh", help="How it is on Zenoh (robot.ros2.transport)."),
@@ -70,16 +66,8 @@ def emulate_ros2(
         str, typer.Option(help="Zenoh endpoint; port 0 takes a free one.")
     ] = "tcp/127.0.0.1:7448",
     fault: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=VALUE",
-            help="A fault from the start, such as camera=frozen or payload=truncated; repeatable. "
-            "While it runs: `corridor emulate fault`.",
-        ),
+        list[str] | None, _faults_option("payload=truncated", "`corridor emulate fault`")
     ] = None,
-    preset: PresetOption = None,
-    config: ConfigOption = None,
-    set_: SetOption = None,
     tethered: TetheredOption = False,
 ) -> None:
     """A ROS 2 robot's Zenoh network; the first line on standard output is where it listens.
@@ -89,12 +77,9 @@ def emulate_ros2(
     """
     if tethered:
         tether()
-    loaded = load(preset, config, set_, others={"robot.ros2.transport": transport})
+    loaded = sources.load({"robot.ros2.transport": transport})
     emulator = import_installed("services.robot_driver.emulation.ros2", "sim,ros2")
-    try:
-        faults = emulator.Ros2Faults().with_texts(fault or [])
-    except ValueError as error:
-        raise ConfigError(f"--fault: {error}") from error
+    faults = _given(emulator.Ros2Faults(), fault)
     emulator.run(loaded.robot, world, listen, faults, typer.echo)
 
 

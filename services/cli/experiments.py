@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from services.cli.options import ConfigOption, SetOption, import_installed, load
+from services.cli.options import ConfigOption, SetOption, Sources, import_installed
 
 
 def add_to(app: typer.Typer) -> None:
@@ -119,7 +119,7 @@ def evaluate(
     """
     command = import_installed("experiments.drives.evaluate_command", "experiments")
     file = config or import_installed("services.commander.frozen", "actor").configuration_of(run)
-    loaded = load(None, file, set_, others={"robot.world": world})
+    loaded = Sources(None, file, set_).load({"robot.world": world})
     folder = out or Path(f"evaluation-{loaded.robot.world}")
     command.run(run, loaded, starts, actions, folder)
     typer.echo(f"written to {folder}")

@@ -7,15 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from services.cli.options import (
-    ConfigOption,
-    EndpointOption,
-    PresetOption,
-    RunDirOption,
-    SetOption,
-    default_folder,
-    load,
-)
+from services.cli.options import EndpointOption, RunDirOption, Sources, default_folder, grouped
 from shared.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -26,32 +18,25 @@ robot = typer.Typer(help="Look at a real robot, and measure it.", no_args_is_hel
 
 def add_to(app: typer.Typer) -> None:
     """Add the commands."""
-    app.command()(doctor)
+    app.command()(grouped(doctor))
     app.add_typer(robot, name="robot")
 
 
-def doctor(
-    preset: PresetOption = None,
-    config: ConfigOption = None,
-    set_: SetOption = None,
-    run_dir: RunDirOption = None,
-    endpoint: EndpointOption = None,
-) -> None:
+def doctor(sources: Sources, run_dir: RunDirOption = None, endpoint: EndpointOption = None) -> None:
     """Look whether this machine can run the system; change nothing.
 
     The last line says that it is ready, or what to do. Exit code 1 then.
     """
     from services.monitor.doctor import run
 
-    loaded = load(preset, config, set_, endpoint=endpoint)
+    loaded = sources.load({"bus.endpoint": endpoint})
     raise typer.Exit(run(loaded, run_dir or default_folder(loaded)))
 
 
 @robot.command("check")
+@grouped
 def robot_check(
-    preset: PresetOption = None,
-    config: ConfigOption = None,
-    set_: SetOption = None,
+    sources: Sources,
     seconds: Annotated[float, typer.Option(min=1.0, max=600.0, help="How long to look.")] = 5.0,
 ) -> None:
     """Connect to a robot, list every sensor, and move nothing.
@@ -61,18 +46,17 @@ def robot_check(
     from services.robot_driver.kinds import make_link
     from services.robot_driver.setup.check import check
 
-    loaded = load(preset, config, set_)
+    loaded = sources.load()
     problems = check(loaded.robot, make_link(loaded), seconds, typer.echo)
     typer.echo(f"not ready: {len(problems)} things to mend" if problems else "ready")
     raise typer.Exit(1 if problems else 0)
 
 
 @robot.command("calibrate")
+@grouped
 def robot_calibrate(
+    sources: Sources,
     out: Annotated[Path, typer.Option(help="Preset to write, such as my-robot.toml.")],
-    preset: PresetOption = None,
-    config: ConfigOption = None,
-    set_: SetOption = None,
     space_m: Annotated[
         float, typer.Option(min=0.2, max=3.0, help="How far it may drive straight ahead.")
     ] = 0.6,
@@ -90,7 +74,7 @@ def robot_calibrate(
 
     if out.exists():
         raise ConfigError(f"--out: {out} exists already")
-    loaded = load(preset, config, set_)
+    loaded = sources.load()
     link = make_link(loaded)
     driven = HardwareRobot(loaded.robot, link)
     try:

@@ -17,10 +17,9 @@ import typer
 
 from services.cli import driving, experiments, machines, run, services
 from services.cli.emulate import emulate
-from services.cli.options import EXIT_CONFIG, EXIT_CRASH, EXIT_ROLE, EXIT_STATE
 from services.cli.secure import secure
 from services.cli.worlds import obstacle, world
-from shared.errors import ConfigError, CorridorError, RoleTaken, StateError
+from shared.errors import ConfigError, CorridorError
 
 UsageError: Any = typer.BadParameter.__mro__[2]
 """Base of all complaints about the command line, wherever this version of Typer keeps Click."""
@@ -48,16 +47,10 @@ def main(arguments: Sequence[str] | None = None, *, first_halt: int | None = Non
     """
     try:
         code = app(arguments, prog_name="corridor", standalone_mode=False, obj=first_halt)
-    except ConfigError as error:
-        return _fail(str(error), EXIT_CONFIG)
-    except StateError as error:
-        return _fail(str(error), EXIT_STATE)
-    except RoleTaken as error:
-        return _fail(str(error), EXIT_ROLE)
     except CorridorError as error:
-        return _fail(str(error), EXIT_CRASH)
+        return _fail(str(error), error.exit_code)
     except UsageError as error:
-        return _fail(error.format_message(), EXIT_CONFIG)
+        return _fail(error.format_message(), ConfigError.exit_code)
     return code if isinstance(code, int) else 0
 
 

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import importlib
+import inspect
 import os
-import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from shared.errors import ConfigError
+from services.extras import import_installed as import_installed
 
 if TYPE_CHECKING:
     from shared.config import Config
 
-EXIT_CRASH, EXIT_CONFIG, EXIT_STATE, EXIT_ROLE = 1, 2, 3, 4
 OURS, CHOOSE = "Configuration", "Which run"
 PresetOption = Annotated[
     str | None,
@@ -93,65 +93,86 @@ AtEpisodeOption = Annotated[
 ]
 
 
-def load(
-    preset: str | None = None,
-    file: Path | None = None,
-    sets: list[str] | None = None,
-    run: str | None = None,
-    seed: int | None = None,
-    endpoint: str | None = None,
-    credentials: Path | None = None,
-    others: Mapping[str, str | int | None] | None = None,
-) -> Config:
-    """The configuration from all sources; dedicated options win over `--set`."""
-    from shared import settings
+Settings = Mapping[str, str | int | Path | None]
+"""Values of dedicated options by key; None: not given."""
 
-    options: dict[str, str | int | None] = {
-        "run.name": run,
-        "run.seed": seed,
-        "bus.endpoint": endpoint,
-        "bus.credentials": str(credentials.absolute()) if credentials else None,
-    }
-    options.update(others or {})
-    chosen = [f"{k}={settings.toml_value(v)}" for k, v in options.items() if v is not None]
-    return settings.load(preset, file, [*(sets or []), *chosen], os.environ)
+
+@dataclass(frozen=True)
+class Sources:
+    """A group of options: where the configuration comes from."""
+
+    preset: PresetOption = None
+    config: ConfigOption = None
+    set_: SetOption = None
+
+    def load(self, options: Settings | None = None) -> Config:
+        """The configuration from all sources; dedicated options win over `--set`."""
+        from shared import settings
+
+        given = {k: v for k, v in (options or {}).items() if v is not None}
+        plain = {k: str(v.absolute()) if isinstance(v, Path) else v for k, v in given.items()}
+        chosen = [f"{k}={settings.toml_value(v)}" for k, v in plain.items()]
+        return settings.load(self.preset, self.config, [*(self.set_ or []), *chosen], os.environ)
+
+
+@dataclass(frozen=True)
+class Which:
+    """A group of options: which run is meant."""
+
+    run: RunOption = None
+    run_dir: RunDirOption = None
+    endpoint: EndpointOption = None
+    credentials: CredentialsOption = None
+
+    @property
+    def settings(self) -> Settings:
+        """The settings that these options stand for."""
+        keys = ("run.name", "bus.endpoint", "bus.credentials")
+        return dict(zip(keys, (self.run, self.endpoint, self.credentials), strict=True))
+
+    def folder(self, config: Config) -> Path:
+        """The folder of the run."""
+        return self.run_dir or default_folder(config)
+
+    def reach(self, *kinds: str) -> Config:
+        """How to reach a running run, with the first of these kinds of credentials there is."""
+        from services.monitor import running
+        from services.security.use import using
+
+        given = str(self.credentials.absolute()) if self.credentials else None
+        found = running.reach(self.run_dir, self.run, self.endpoint, os.environ, given)
+        return using(found, *(kinds or ("operator", "watcher")))
+
+
+def grouped(command: Callable[..., None], without: str = "") -> Callable[..., None]:
+    """A command for Typer: the options of each group stand in place of the group.
+
+    without: an option that it does not have.
+    """
+    groups: dict[str, Any] = {}
+    options: list[inspect.Parameter] = []
+    for parameter in inspect.signature(command, eval_str=True).parameters.values():
+        if is_dataclass(kind := parameter.annotation):
+            groups[parameter.name] = kind
+            types = get_type_hints(kind, include_extras=True)
+            options += [
+                parameter.replace(name=f.name, default=f.default, annotation=types[f.name])
+                for f in fields(kind)
+            ]
+        elif parameter.name != without:
+            options.append(parameter)
+
+    @wraps(command)
+    def called(**values: Any) -> None:
+        for name, kind in groups.items():
+            values[name] = kind(**{f.name: values.pop(f.name) for f in fields(kind)})
+        command(**values)
+
+    alone = [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
+    called.__signature__ = inspect.Signature(alone)  # type: ignore[attr-defined]
+    return called
 
 
 def default_folder(config: Config) -> Path:
     """The folder of a run for which none was given."""
     return Path("runs") / config.run.name
-
-
-def reach(
-    run: str | None,
-    run_dir: Path | None,
-    endpoint: str | None,
-    credentials: Path | None,
-    *kinds: str,
-) -> Config:
-    """How to reach a running run, with the first of these kinds of credentials that is there."""
-    from services.monitor import running
-    from services.security.use import using
-
-    given = str(credentials.absolute()) if credentials else None
-    found = running.reach(run_dir, run, endpoint, os.environ, given)
-    return using(found, *(kinds or ("operator", "watcher")))
-
-
-def import_installed(module: str, extra: str) -> Any:
-    """Import a module of ours that needs the libraries of an extra.
-
-    Raises:
-        ConfigError: one of these libraries is not installed.
-    """
-    try:
-        return importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] in {"experiments", "services", "shared"}:
-            raise
-        remedy = f"pip install 'corridor[{extra}]'"
-        if error.name == "pybullet" and sys.version_info >= (3, 12):
-            remedy = "it has no wheels for this Python, use Python 3.11"
-        raise ConfigError(
-            f"{extra}: needs the Python package {error.name}, which is not installed: {remedy}"
-        ) from error

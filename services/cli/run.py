@@ -8,20 +8,17 @@ import typer
 
 from services.cli.options import (
     CHOOSE,
-    ConfigOption,
     CredentialsOption,
-    EndpointOption,
     InsecureOption,
-    PresetOption,
     RobotOption,
     RunDirOption,
     RunOption,
     SeedOption,
-    SetOption,
+    Sources,
+    Which,
     default_folder,
+    grouped,
     import_installed,
-    load,
-    reach,
 )
 
 if TYPE_CHECKING:
@@ -45,18 +42,16 @@ OwnRouterOption = Annotated[
 def add_to(app: typer.Typer) -> None:
     """Add the commands."""
     for command in (up, status, stop):
-        app.command()(command)
+        app.command()(grouped(command))
     _add_order(app, "estop", "Stop robots at once; they stay stopped until `corridor clear`.")
     _add_order(app, "clear", "Release the emergency stop of robots.")
     _add_order(app, "pause", "Let robots wait after the current action, until `corridor resume`.")
     _add_order(app, "resume", "Let paused robots drive on.")
-    app.command("config")(show_config)
+    app.command("config")(grouped(show_config))
 
 
 def up(
-    preset: PresetOption = None,
-    config: ConfigOption = None,
-    set_: SetOption = None,
+    sources: Sources,
     run: RunOption = None,
     seed: SeedOption = None,
     run_dir: RunDirOption = None,
@@ -74,9 +69,9 @@ def up(
     Ctrl-C stops everything within five seconds; the same command continues the run. The space key
     is the emergency stop of all its robots. All that a run produces lies in its folder.
     """
-    loaded = load(
-        preset, config, set_, run, seed, endpoint, credentials, {"run.episodes": episodes}
-    )
+    options = {"run.name": run, "run.seed": seed, "run.episodes": episodes}
+    bus = {"bus.endpoint": endpoint, "bus.credentials": credentials}
+    loaded = sources.load({**options, **bus})
     from services.launcher.up import run_all
 
     if loaded.robot.kind == "sim":  # refused before anything starts
@@ -95,10 +90,7 @@ def up(
 
 
 def status(
-    run: RunOption = None,
-    run_dir: RunDirOption = None,
-    endpoint: EndpointOption = None,
-    credentials: CredentialsOption = None,
+    which: Which,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     require: Annotated[
         list[str] | None,
@@ -111,16 +103,11 @@ def status(
     """List the services of a run that are alive, with versions, rates and memory."""
     from services.monitor.status import show
 
-    raise typer.Exit(
-        show(reach(run, run_dir, endpoint, credentials), as_json=as_json, require=require or [])
-    )
+    raise typer.Exit(show(which.reach(), as_json=as_json, require=require or []))
 
 
 def stop(
-    run: RunOption = None,
-    run_dir: RunDirOption = None,
-    endpoint: EndpointOption = None,
-    credentials: CredentialsOption = None,
+    which: Which,
     service: Annotated[
         list[str] | None,
         typer.Option(metavar="SERVICE", help="Only this service (driver, actor, ...); repeatable."),
@@ -129,33 +116,22 @@ def stop(
     """Ask the services of a run to stop cleanly; `corridor up` ends with them."""
     from services.monitor.operator import stop_services
 
-    raise typer.Exit(stop_services(reach(run, run_dir, endpoint, credentials), service or []))
+    raise typer.Exit(stop_services(which.reach(), service or []))
 
 
 def _add_order(app: typer.Typer, name: RobotOrder, text: str) -> None:
     """Add a command that robots acknowledge."""
 
-    def command(
-        context: typer.Context,
-        run: RunOption = None,
-        run_dir: RunDirOption = None,
-        endpoint: EndpointOption = None,
-        credentials: CredentialsOption = None,
-        robot: RobotOption = None,
-    ) -> None:
+    def command(context: typer.Context, which: Which, robot: RobotOption = None) -> None:
         from services.monitor.operator import command_robots
 
-        there = reach(run, run_dir, endpoint, credentials)
+        raise typer.Exit(command_robots(which.reach(), name, robot, context.obj))
 
-        raise typer.Exit(command_robots(there, name, robot, context.obj))
-
-    app.command(name, help=text)(command)
+    app.command(name, help=text)(grouped(command))
 
 
-def show_config(
-    preset: PresetOption = None, config: ConfigOption = None, set_: SetOption = None
-) -> None:
+def show_config(sources: Sources) -> None:
     """Print the resolved configuration as TOML, every key with its value."""
     from shared.settings import to_toml
 
-    typer.echo(to_toml(load(preset, config, set_)), nl=False)
+    typer.echo(to_toml(sources.load()), nl=False)

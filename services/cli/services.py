@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import inspect
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from services.cli.options import (
-    ConfigOption,
     CredentialsOption,
-    EndpointOption,
     InsecureOption,
-    PresetOption,
     RobotsOption,
-    RunDirOption,
-    RunOption,
     SeedOption,
-    SetOption,
+    Sources,
     TetheredOption,
-    default_folder,
+    Which,
+    grouped,
     import_installed,
-    load,
 )
 from services.launcher.tether import tether
 from services.processes import ACTOR, ROUTER, SERVICES, Process
@@ -36,35 +31,28 @@ def add_to(app: typer.Typer) -> None:
     """Add the commands."""
     for process in SERVICES:
         _add_service(app, process)
-    app.command(ROUTER.name, help=ROUTER.purpose)(router)
+    app.command(ROUTER.name, help=ROUTER.purpose)(grouped(router))
 
 
 def _add_service(app: typer.Typer, process: Process) -> None:
     """Add the command that runs one service in this process."""
 
     def command(
-        preset: PresetOption = None,
-        config: ConfigOption = None,
-        set_: SetOption = None,
+        sources: Sources,
+        which: Which,
         seed: SeedOption = None,
-        run: RunOption = None,
-        run_dir: RunDirOption = None,
-        endpoint: EndpointOption = None,
-        credentials: CredentialsOption = None,
         robots: RobotsOption = None,
         tethered: TetheredOption = False,
     ) -> None:
         if tethered:
             tether()
-        chosen = [*(set_ or []), *([f"run.robots={robots.split(',')}"] if robots else [])]
-        loaded = load(preset, config, chosen, run, seed, endpoint, credentials)
-        raise typer.Exit(serve(process, loaded, run_dir or default_folder(loaded)))
+        served = [f"run.robots={robots.split(',')}"] if robots else []
+        chosen = replace(sources, set_=[*(sources.set_ or []), *served])
+        loaded = chosen.load({**which.settings, "run.seed": seed})
+        raise typer.Exit(serve(process, loaded, which.folder(loaded)))
 
-    if process is not ACTOR:
-        parameters = inspect.signature(command, eval_str=True).parameters
-        fitting = [parameters[name] for name in parameters if name != "robots"]
-        command.__signature__ = inspect.Signature(fitting)  # type: ignore[attr-defined]
-    app.command(process.name, help=process.purpose)(command)
+    without = "" if process is ACTOR else "robots"
+    app.command(process.name, help=process.purpose)(grouped(command, without))
 
 
 def serve(process: Process, config: Config, folder: Path) -> int:
@@ -92,9 +80,7 @@ def serve(process: Process, config: Config, folder: Path) -> int:
 
 
 def router(
-    preset: PresetOption = None,
-    config: ConfigOption = None,
-    set_: SetOption = None,
+    sources: Sources,
     listen: Annotated[
         str | None,
         typer.Option(
@@ -107,7 +93,7 @@ def router(
     tethered: TetheredOption = False,
 ) -> None:
     """Route between the services of runs until stopped."""
-    loaded = load(preset, config, set_, endpoint=listen, credentials=credentials)
+    loaded = sources.load({"bus.endpoint": listen, "bus.credentials": credentials})
     bus = using(loaded, ROUTER.name).bus
     if tethered:
         tether()

@@ -8,19 +8,12 @@ from typing import Annotated, Any
 import typer
 
 from services.cli.options import (
-    EXIT_CRASH,
     AtEpisodeOption,
-    ConfigOption,
-    CredentialsOption,
-    EndpointOption,
-    PresetOption,
     RobotOption,
-    RunDirOption,
-    RunOption,
-    SetOption,
+    Sources,
+    Which,
+    grouped,
     import_installed,
-    load,
-    reach,
 )
 
 WorldName = Annotated[
@@ -56,22 +49,18 @@ def world_render(
 
 
 @world.command("check")
-def world_check(
-    name: WorldName,
-    preset: PresetOption = None,
-    config: ConfigOption = None,
-    set_: SetOption = None,
-) -> None:
+@grouped
+def world_check(sources: Sources, name: WorldName) -> None:
     """Print what is wrong with a world (exit code 1), or measure it: how hard it is, laps, tour."""
     worlds = import_installed("services.robot_driver.simulated.world", "sim")
     survey = import_installed("services.robot_driver.atlas.survey", "sim")
     path = worlds.world_path(name)
-    loaded = load(preset, config, set_, others={"robot.world": path.stem})
+    loaded = sources.load({"robot.world": path.stem})
     problems = survey.problems_in(path, loaded)
     for line in problems:
         typer.echo(line)
     if problems:
-        raise typer.Exit(EXIT_CRASH)
+        raise typer.Exit(1)
     for key, value in survey.survey(loaded, worlds.read_world(path)).items():
         typer.echo(f"{key:40} {value:.3f}" if isinstance(value, float) else f"{key:40} {value}")
 
@@ -80,14 +69,12 @@ def world_check(
 
 
 @world.command("switch")
+@grouped
 def world_switch(
+    which: Which,
     name: Annotated[str, typer.Argument(help="World to drive in, such as minus.")],
     start: Annotated[int, typer.Option(min=0, help="Which of its start poses.")] = 0,
     at_episode: AtEpisodeOption = 0,
-    run: RunOption = None,
-    run_dir: RunDirOption = None,
-    endpoint: EndpointOption = None,
-    credentials: CredentialsOption = None,
     robot: RobotOption = None,
 ) -> None:
     """Let robots of a running simulation go on in another world.
@@ -95,11 +82,13 @@ def world_switch(
     Samples that look ahead across the change are dropped and counted.
     """
     change = {"kind": "switch", "world": name, "start": start, "at_episode": at_episode}
-    raise typer.Exit(_change_world(run, run_dir, endpoint, credentials, robot, change))
+    raise typer.Exit(_change_world(which, robot, change))
 
 
 @obstacle.command("place")
+@grouped
 def obstacle_place(
+    which: Which,
     name: Annotated[str, typer.Argument(help="Name of the box, to remove it by.")],
     x: Annotated[float, typer.Option(help="Of its middle, m.")],
     y: Annotated[float, typer.Option(help="Of its middle, m.")],
@@ -109,10 +98,6 @@ def obstacle_place(
     height: Annotated[float, typer.Option(help="m.")] = 0.5,
     rgb: Annotated[tuple[int, int, int], typer.Option(help="Colour, 0..255 each.")] = (200, 60, 40),
     at_episode: AtEpisodeOption = 0,
-    run: RunOption = None,
-    run_dir: RunDirOption = None,
-    endpoint: EndpointOption = None,
-    credentials: CredentialsOption = None,
     robot: RobotOption = None,
 ) -> None:
     """Let a box stand in the world of a running simulation: solid, and seen."""
@@ -127,33 +112,24 @@ def obstacle_place(
         "rgb": rgb,
     }
     change = {"kind": "place", "box": box, "at_episode": at_episode}
-    raise typer.Exit(_change_world(run, run_dir, endpoint, credentials, robot, change))
+    raise typer.Exit(_change_world(which, robot, change))
 
 
 @obstacle.command("remove")
+@grouped
 def obstacle_remove(
+    which: Which,
     name: Annotated[str, typer.Argument(help="Name of the box.")],
     at_episode: AtEpisodeOption = 0,
-    run: RunOption = None,
-    run_dir: RunDirOption = None,
-    endpoint: EndpointOption = None,
-    credentials: CredentialsOption = None,
     robot: RobotOption = None,
 ) -> None:
     """Take a box away again, one that was placed or one that belongs to the world."""
     change = {"kind": "remove", "name": name, "at_episode": at_episode}
-    raise typer.Exit(_change_world(run, run_dir, endpoint, credentials, robot, change))
+    raise typer.Exit(_change_world(which, robot, change))
 
 
-def _change_world(
-    run: str | None,
-    run_dir: Path | None,
-    endpoint: str | None,
-    credentials: Path | None,
-    robot: str | None,
-    change: dict[str, Any],
-) -> int:
+def _change_world(which: Which, robot: str | None, change: dict[str, Any]) -> int:
     """Wish for a change of the world of a run's robots; returns the exit code."""
     from services.monitor.operator import change_world
 
-    return change_world(reach(run, run_dir, endpoint, credentials), robot, **change)
+    return change_world(which.reach(), robot, **change)

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from services.commander import frozen
 from shared import run_record, settings
 from shared.config import Config, NetworkConfig, RobotConfig
-from shared.errors import ConfigError, StateError
+from shared.errors import ConfigError, StateError, first_problem
 from shared.facts import ACTIONS, IMAGE_SHAPE
 from shared.rl.preprocess import PREPROCESS_VERSION
 from shared.statefile import write_atomically
@@ -89,9 +89,7 @@ def of(found: frozen.Frozen) -> Bundle | None:
     try:
         bundle = Bundle.model_validate_json(text)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(map(str, first["loc"]))
-        raise StateError(f"{found.path}: damaged bundle: {place}: {first['msg']}") from error
+        raise StateError(f"{found.path}: damaged bundle: {first_problem(error)}") from error
     for what, here in (
         ("format", FORMAT),
         ("preprocessing", PREPROCESS_VERSION),

@@ -10,13 +10,14 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from services.launcher.supervisor import Ending, Supervisor
-from services.launcher.up import child_specs, free_endpoint, stop_on_signals
+from services.launcher.up import child_specs, free_endpoint
 from services.monitor.running import locked
 from services.processes import DRIVER
 from shared import settings
 from shared.bus import Bus
 from shared.config import Config
 from shared.errors import ConfigError, PeerMissing, RouterMissing
+from shared.threads import stop_on_signals
 
 TICK_S = 0.1
 START_S = 90.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol, TextIO
+from typing import TextIO
 
 from rich.console import Console
 from rich.live import Live
@@ -16,13 +16,6 @@ LINE_EVERY_S = 5.0
 """Period of the plain lines; a change of the warnings shows at once."""
 LEAST_COLUMNS, LEAST_ROWS = 70, 20
 """In a smaller window the table would lose its end, which tells what is wrong."""
-
-
-class Display(Protocol):
-    """Shows views."""
-
-    def show(self, view: RunView) -> None:
-        """Show the newest view."""
 
 
 class Table:
@@ -57,7 +50,7 @@ class Lines:
 
 
 @contextmanager
-def display_for(output: TextIO) -> Iterator[Display]:
+def display_for(output: TextIO) -> Iterator[Lines | Table]:
     """The display that suits an output."""
     console = Console(file=output, markup=False, emoji=False)
     if not console.is_terminal:

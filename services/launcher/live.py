@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from services.launcher.supervisor import ChildStatus
-from services.monitor.heartbeats import Seen, Snapshot
+from services.monitor.heartbeats import Snapshot
 from services.monitor.words import (
     by_action,
     duration,
@@ -23,7 +23,7 @@ from services.monitor.words import (
     replay_doing,
     retention,
 )
-from shared.messages import ActorState, LearnerState, Message, ReplayState, RobotState
+from shared.messages import ActorState, LearnerState, ReplayState, RobotState
 
 BAR_WIDTH = 30
 RECENT_S = 60.0
@@ -88,29 +88,14 @@ def _child_warnings(view: RunView) -> Iterator[str]:
 
 
 def _silences(view: RunView) -> Iterator[str]:
-    snapshot = view.snapshot
-    heartbeats: dict[str, Seen[Message] | None] = {
-        "replay": snapshot.replay,
-        "learner": snapshot.learner,
-        **{f"robot {name}": seen for name, seen in snapshot.robots.items()},
-        **{f"actor of {name}": seen for name, seen in snapshot.actors.items()},
-    }
-    for name, seen in heartbeats.items():
-        if seen is not None and seen.age_s > 3 * view.heartbeat_s:
+    for name, seen in view.snapshot.everybody.items():
+        if seen.age_s > 3 * view.heartbeat_s:
             yield f"{name}: silent for {seen.age_s:.0f} s"
 
 
 def _losses(view: RunView) -> Iterator[str]:
     snapshot = view.snapshot
-    undecodable = sum(
-        seen.message.undecodable
-        for seen in (
-            *snapshot.robots.values(),
-            *snapshot.actors.values(),
-            *((snapshot.replay,) if snapshot.replay else ()),
-            *((snapshot.learner,) if snapshot.learner else ()),
-        )
-    )
+    undecodable = sum(seen.message.undecodable for seen in snapshot.everybody.values())
     if undecodable:
         yield f"{undecodable} messages could not be decoded"
     if snapshot.replay and snapshot.replay.message.refused:

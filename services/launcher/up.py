@@ -5,12 +5,10 @@ from __future__ import annotations
 import logging
 import os
 import random
-import signal
 import socket
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,6 +27,7 @@ from shared.errors import ConfigError
 from shared.numerics import settle_all
 from shared.service import setup_logging
 from shared.statefile import write_atomically
+from shared.threads import stop_on_signals
 
 log = logging.getLogger(__name__)
 
@@ -170,21 +169,3 @@ def reachable(listen: str) -> str:
     if listen.endswith(":0"):
         raise ConfigError(f"--listen: expected a fixed port, got {listen!r}")
     return listen.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
-
-
-@contextmanager
-def stop_on_signals() -> Iterator[threading.Event]:
-    """An event that Ctrl-C, SIGTERM and a closed terminal set; handlers are put back at the end.
-
-    Where a closed terminal is ignored already, as under nohup, it stays ignored.
-    """
-    stop = threading.Event()
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-        numbers.append(signal.SIGHUP)
-    before = {number: signal.signal(number, lambda *_: stop.set()) for number in numbers}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from shared import columns
 from shared.bus import Bus
 from shared.errors import PeerSilent
-from shared.keys import CHANGES, SNAPSHOT
-from shared.messages import NO_LINEAGE, Change, ChangesRequest, FeedEnd, SnapshotRequest
+from shared.keys import CHANGES, SNAPSHOT, Stream
+from shared.messages import NO_LINEAGE, Change, ChangesRequest, FeedEnd, Message, SnapshotRequest
 from shared.rl.memory import MIRROR, SampleStore
 
 PATIENCE_S = 60.0
@@ -40,14 +40,14 @@ class Mirror:
             return
         if self.number is not None:
             request = ChangesRequest(since=self.number, upto=number, lineage=self.lineage)
-            replies: Iterator[Change | FeedEnd] = bus.request_many(
-                CHANGES, request, Change, FeedEnd, patience_s=PATIENCE_S
-            )
-            parts, end = _received(replies, progress)
+            received = list(_received(bus, CHANGES, request, progress))
+            end = received[-1]
+            assert isinstance(end, FeedEnd)
             if not end.gone and (end.change, end.lineage) == (number, lineage):
                 self.number = None  # until all of them are in
-                for part in parts:
-                    _take(self.samples, part)
+                for part in received:
+                    if isinstance(part, Change):
+                        _take(self.samples, part)
                 self.number, self.lineage = number, lineage
                 return
             self.resyncs += 1
@@ -55,37 +55,34 @@ class Mirror:
 
     def _snapshot(self, bus: Bus, number: int, lineage: str, progress: Callable[[], None]) -> None:
         self.samples, self.number = SampleStore(), None
-        request = SnapshotRequest()
-        replies = bus.request_many(SNAPSHOT, request, Change, FeedEnd, patience_s=PATIENCE_S)
-        samples, rows, messages = SampleStore(), 0, 0
-        for part in replies:
-            progress()
+        samples = SampleStore()
+        for part in _received(bus, SNAPSHOT, SnapshotRequest(), progress):
             if isinstance(part, FeedEnd):
-                _check_complete(part, rows, messages)
                 if part.change < number or (part.change == number and part.lineage != lineage):
                     raise PeerSilent(
                         f"snapshot at change {part.change} of lineage {part.lineage}, "
                         f"expected {number} of {lineage}"
                     )
                 self.samples, self.number, self.lineage = samples, part.change, part.lineage
-                return
-            assert isinstance(part, Change)
-            _take(samples, part)
-            rows, messages = rows + part.count, messages + 1
-        raise PeerSilent(f"snapshot broke off after {rows} rows")
+            else:
+                _take(samples, part)
 
 
 def _received(
-    replies: Iterable[Change | FeedEnd], progress: Callable[[], None]
-) -> tuple[list[Change], FeedEnd]:
-    parts: list[Change] = []
-    for reply in replies:
+    bus: Bus, stream: Stream, request: Message, progress: Callable[[], None]
+) -> Iterator[Change | FeedEnd]:
+    """Yield the parts of a transfer and, last, its end. Raises PeerSilent if it is not complete."""
+    rows = messages = 0
+    for part in bus.request_many(stream, request, Change, FeedEnd, patience_s=PATIENCE_S):
         progress()
-        if isinstance(reply, FeedEnd):
-            _check_complete(reply, sum(p.count for p in parts), len(parts))
-            return parts, reply
-        parts.append(reply)
-    raise PeerSilent(f"changes broke off after {len(parts)} parts")
+        if isinstance(part, FeedEnd):
+            _check_complete(part, rows, messages)
+            yield part
+            return
+        assert isinstance(part, Change)
+        rows, messages = rows + part.count, messages + 1
+        yield part
+    raise PeerSilent(f"transfer broke off after {rows} rows in {messages} parts")
 
 
 def _check_complete(end: FeedEnd, rows: int, messages: int) -> None:

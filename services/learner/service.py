@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from services.learner.mirror import Mirror
 from services.processes import MAIN
 from shared.complaints import Complaints
 from shared.config import Config
-from shared.errors import BadMessage, BusError, PeerSilent, StateError
+from shared.errors import BusError, StateError
 from shared.inbox import Inbox
 from shared.keys import LEARNER_STATE, REPLAY_STATE, TURNS, WEIGHTS
 from shared.messages import LearnerState, ReplayState, Turn, Turns, TurnsRequest
@@ -30,7 +29,6 @@ from shared.service import TICK_S, Service, Stopped, service
 from shared.weights import parts
 
 Activity = Literal["waiting", "synchronising", "training", "fitting", "checkpoint"]
-T = TypeVar("T")
 TAKEOVER = 2
 """How far above the versions that replay knows a learner without its checkpoint goes on: an actor
 may have one more than replay."""
@@ -138,28 +136,17 @@ class LearnerLoop:
     def _ask_turns(self, since: int) -> tuple[Turn, ...]:
         """Turns after an episode, as replay has them. Raises Stopped."""
         request = TurnsRequest(since=since)
-        return self._insist("ask replay for turns", lambda: self._turns(request)).turns
+        return self._me.insist("ask replay for turns", lambda: self._turns(request)).turns
 
     def _turns(self, request: TurnsRequest) -> Turns:
         self._serve()
         return self._me.bus.request(TURNS, request, Turns)
 
-    def _insist(self, what: str, attempt: Callable[[], T]) -> T:
-        """Ask until there is an answer; one that is no message is none. Raises Stopped."""
-
-        def answered() -> T:
-            try:
-                return attempt()
-            except BadMessage as error:
-                raise PeerSilent(str(error)) from error
-
-        return self._me.insist(what, answered)
-
     def _turn(self, turn: Turn) -> None:
         """Everything the learner does about one episode (E25). Raises Stopped, OtherTurn."""
         start_s = time.monotonic()
         self._activity = "synchronising"
-        self._insist("pull changes from replay", lambda: self._reach(turn))
+        self._me.insist("pull changes from replay", lambda: self._reach(turn))
         steps_before = self._trainer.train_steps
         losses = self._learn(turn)
         self._new = False
@@ -167,11 +154,11 @@ class LearnerLoop:
         self._loss = float(np.mean(losses)) if losses else None
         steps = self._trainer.train_steps - steps_before
         row = self._row(turn, steps, time.monotonic() - start_s)
-        self._insist("write down a turn", lambda: self._metrics.write(row))
+        self._me.insist("write down a turn", lambda: self._metrics.write(row))
         self._activity = "checkpoint"
         try:
             weights = self._checked_weights() if changed else self._weights
-            self._insist(
+            self._me.insist(
                 "write a checkpoint", lambda: self._keep(turn, fitted=bool(row["fitting"]))
             )
         except FloatingPointError as error:

@@ -15,7 +15,6 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
@@ -23,6 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from shared.config import Config
+from shared.provenance import version_of
 
 Verdict = Literal["good", "slow", "bad"]
 MIB, GIB = 2**20, 2**30
@@ -171,9 +171,8 @@ def _clock() -> Finding:
 
 def _libraries() -> Iterator[Finding]:
     for package, extras in LIBRARIES.items():
-        try:
-            version = metadata.version(package)
-        except metadata.PackageNotFoundError:
+        version = version_of(package)
+        if not version:
             verdict: Verdict = "good" if extras else "bad"
             advice = "" if extras else f"pip install {package}"
             yield Finding(package, f"not installed (extra {extras})", verdict, advice)
@@ -188,19 +187,11 @@ def _libraries() -> Iterator[Finding]:
 
 
 def _gpu() -> Finding:
-    if _missing("torch"):
+    if not version_of("torch"):
         return Finding("GPU", "unknown without torch")
     code = "import torch; print(torch.cuda.get_device_name() if torch.cuda.is_available() else '')"
     name = _python_says(code)[1].strip()
     return Finding("GPU", name or "none that torch can use", "good" if name else "slow")
-
-
-def _missing(package: str) -> bool:
-    try:
-        metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return True
-    return False
 
 
 def _import_fault(module: str) -> str:

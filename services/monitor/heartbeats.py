@@ -32,6 +32,16 @@ class Snapshot:
     learner: Seen[LearnerState] | None = None
 
     @property
+    def everybody(self) -> dict[str, Seen[Any]]:
+        """Every heartbeat, by what people call its sender."""
+        return {
+            **({"replay": self.replay} if self.replay else {}),
+            **({"learner": self.learner} if self.learner else {}),
+            **{f"robot {name}": seen for name, seen in self.robots.items()},
+            **{f"actor of {name}": seen for name, seen in self.actors.items()},
+        }
+
+    @property
     def episodes_done(self) -> int:
         """Episodes through the whole loop: stored, trained on, checkpoint on disk."""
         return self.learner.message.episode if self.learner else 0

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import typer
@@ -28,6 +25,7 @@ from shared.messages import (
     WorldChanged,
 )
 from shared.service import new_life
+from shared.threads import stop_on_signals
 
 M = TypeVar("M", bound=Message)
 
@@ -53,22 +51,9 @@ def command_robots(
         RouterMissing: there is no router.
     """
     _check_name(robot)
-    with Bus(config.bus, config.run.name) as bus, interruptible() as ended:
+    with Bus(config.bus, config.run.name) as bus, stop_on_signals() as ended:
         obeyed = order(bus, name, robot or ALL, typer.echo, number=number, ended=ended.is_set)
     return 0 if obeyed else 1
-
-
-@contextmanager
-def interruptible() -> Iterator[threading.Event]:
-    """An event that Ctrl-C and SIGTERM set while the block runs."""
-    ended = threading.Event()
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = {number: signal.signal(number, lambda *_: ended.set()) for number in numbers}
-    try:
-        yield ended
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _check_name(robot: str | None) -> None:

@@ -22,7 +22,7 @@ from typing import BinaryIO, Self
 from mcap.writer import CompressionType, Writer
 
 from services.recorder.tap import Heard
-from shared.config import ActorNumerics, Config
+from shared.config import Config, Numerics
 from shared.errors import ConfigError
 from shared.keys import STREAMS, Stream
 from shared.messages import PROTOCOL_VERSION
@@ -43,7 +43,7 @@ class Origin:
     """The run that a recording is of, and all that decides what its actor chooses."""
 
     config: Config
-    numerics: ActorNumerics
+    numerics: Numerics
     """Settled numerics of the actor."""
     protocol: int = PROTOCOL_VERSION
     preprocessing: int = PREPROCESS_VERSION

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from services.recorder.recording import RECORDED, Origin, RecordingWriter
 from services.recorder.tap import Tap
-from shared.config import ActorNumerics, Config
+from shared.config import Config, Numerics
 from shared.errors import ConfigError, StateError
+from shared.numerics import known
 from shared.service import EXIT_CRASH, TICK_S, Service, Stopped, service
 from shared.weights import WeightsFetcher
 
@@ -55,21 +53,14 @@ def run(
     return 0
 
 
-def actor_numerics(config: Config, folder: Path) -> ActorNumerics:
+def actor_numerics(config: Config, folder: Path) -> Numerics:
     """How the run's actor computes. Raises ConfigError when that was chosen elsewhere."""
-    wanted = config.numerics.actor
-    if wanted.settled:
-        return wanted
-    path = folder / "numerics" / "actor.json"
-    try:
-        return ActorNumerics.model_validate(json.loads(path.read_text()))
-    except FileNotFoundError as error:
+    if (found := known(config, folder, "actor")) is None:
         raise ConfigError(
-            f"numerics.actor: chosen when the run first starts, expected in {path}, which is not "
-            f"there: record beside the run, with --run-dir"
-        ) from error
-    except (OSError, ValidationError, ValueError) as error:
-        raise StateError(f"{path}: damaged: {str(error).splitlines()[0]}") from error
+            f"numerics.actor: chosen when the run first starts, expected in {folder}, which has "
+            f"none: record beside the run, with --run-dir"
+        )
+    return found
 
 
 class Recorder:

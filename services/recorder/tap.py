@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from shared.bus import Bus
+from shared.inbox import Arrivals
 from shared.keys import Stream
 
 MAX_MESSAGES, MAX_BYTES = 20_000, 64 * 1024 * 1024
@@ -27,17 +27,16 @@ class Heard:
     data: bytes
 
 
-class Tap:
+class Tap(Arrivals):
     """Messages of these streams of a run from now on, for a thread that keeps up.
 
     At most `MAX_MESSAGES` of them and `MAX_BYTES` wait; what comes beyond that is lost and counted.
     """
 
     def __init__(self, bus: Bus, streams: Sequence[Stream]) -> None:
-        self._ready = threading.Condition()
+        super().__init__()
         self._waiting: deque[Heard] = deque()
         self._bytes = 0
-        self._woken = False
         self.lost: Counter[str] = Counter()
         """Messages not taken, by stream: too many waiting, oversized or badly addressed."""
         for stream in streams:
@@ -53,22 +52,15 @@ class Tap:
                     return
                 self._waiting.append(Heard(stream, ident, time.time_ns(), data))
                 self._bytes += size
-                self._ready.notify_all()
+                self._arrive()
 
         bus.subscribe(stream, "*", keep)
 
     def take(self, timeout_s: float) -> list[Heard]:
         """All that waits, as soon as there is something; empty at the timeout or when woken."""
+        self.wait(timeout_s)
         with self._ready:
-            self._ready.wait_for(lambda: bool(self._waiting) or self._woken, timeout_s)
-            self._woken = False
             taken = list(self._waiting)
             self._waiting.clear()
             self._bytes = 0
             return taken
-
-    def wake(self) -> None:
-        """Let `take` return (any thread)."""
-        with self._ready:
-            self._woken = True
-            self._ready.notify_all()

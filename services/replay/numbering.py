@@ -16,6 +16,7 @@ import numpy as np
 from shared.config import MemoryConfig
 from shared.errors import StateError
 from shared.messages import MAX_EPISODE_SAMPLES, Episode, RobotProgress
+from shared.rl.turn import Commit
 
 MAX_ROBOTS = 256
 """Robots that one memory keeps numbers of."""
@@ -67,6 +68,10 @@ class Counters:
         """Most actions that one robot drove without a bump, across episodes (E10, E43)."""
         return max((robot.longest_run_actions for robot in self.robots.values()), default=0)
 
+    def plus(self, **amounts: int) -> Counters:
+        """Return the counters with these amounts added."""
+        return replace(self, **{name: getattr(self, name) + n for name, n in amounts.items()})
+
     def to_dict(self) -> dict[str, Any]:
         """Return plain values that msgpack can write."""
         return asdict(self)
@@ -79,17 +84,6 @@ class Counters:
             return cls(**{**values, "robots": robots})
         except (KeyError, TypeError, AttributeError) as error:
             raise StateError(f"replay counters on disk are damaged: {error}") from error
-
-
-@dataclass(frozen=True)
-class Commit:
-    """One accepted submission: its numbers and what of it is stored."""
-
-    commit: int
-    episode: int
-    """Global episode number; 0 for fill submissions."""
-    first_id: int
-    stored: int
 
 
 def filling(counters: Counters, config: MemoryConfig) -> bool:
@@ -165,15 +159,17 @@ def accept(counters: Counters, config: MemoryConfig, episode: Episode) -> tuple[
         room = config.capacity - counters.filled if filling(counters, config) else 0
         stored, number = min(episode.count, room), 0
         robot = replace(robot, fills=robot.fills + 1)
-        counters = replace(
-            counters,
-            filled=counters.filled + stored,
-            fill_surplus=counters.fill_surplus + episode.count - stored,
-        )
+        counters = counters.plus(filled=stored, fill_surplus=episode.count - stored)
     else:
         stored, number = episode.count, counters.episode + 1
         robot = replace(robot, episodes=robot.episodes + 1)
-        counters = _count_episode(counters, episode)
+        counters = counters.plus(
+            episode=1,
+            bumps=int(episode.bump),
+            actions=episode.actions,
+            laps_left=episode.laps_left,
+            laps_right=episode.laps_right,
+        )
     run, length = bump_free(robot.run_actions, episode)
     robot = replace(
         robot,
@@ -184,14 +180,13 @@ def accept(counters: Counters, config: MemoryConfig, episode: Episode) -> tuple[
         longest_run_actions=max(robot.longest_run_actions, length),
     )
     commit = Commit(counters.commit + 1, number, counters.next_id, stored)
-    return commit, replace(
-        counters,
-        commit=commit.commit,
-        next_id=counters.next_id + stored,
-        dropped_samples=counters.dropped_samples + episode.dropped_samples,
-        dropped_episodes=counters.dropped_episodes + episode.dropped_episodes,
-        robots={**counters.robots, episode.robot: robot},
+    counters = counters.plus(
+        commit=1,
+        next_id=stored,
+        dropped_samples=episode.dropped_samples,
+        dropped_episodes=episode.dropped_episodes,
     )
+    return commit, replace(counters, robots={**counters.robots, episode.robot: robot})
 
 
 def bump_free(run: int, episode: Episode) -> tuple[int, int]:
@@ -222,16 +217,4 @@ def progress_of(counters: Counters, config: MemoryConfig, robot: str) -> RobotPr
         episode=counters.episode,
         robot_life=known.life,
         last_sequence=known.last_sequence,
-    )
-
-
-def _count_episode(counters: Counters, episode: Episode) -> Counters:
-    """Totals after a counted episode."""
-    return replace(
-        counters,
-        episode=counters.episode + 1,
-        bumps=counters.bumps + int(episode.bump),
-        actions=counters.actions + episode.actions,
-        laps_left=counters.laps_left + episode.laps_left,
-        laps_right=counters.laps_right + episode.laps_right,
     )

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from services.replay import numbering
 from services.replay.feed import PART_ROWS, Feed
-from services.replay.numbering import Commit, Counters, Span
+from services.replay.numbering import Counters, Span
 from services.replay.tables import (
     MARKS,
     REWARDS,
@@ -28,7 +28,7 @@ from shared.config import MemoryConfig
 from shared.messages import NO_LINEAGE, Episode, Turn
 from shared.rl.memory import ReplayMemory
 from shared.rl.retention.strategy import columns
-from shared.rl.turn import Maintenance, sample_rows
+from shared.rl.turn import Commit, Maintenance, sample_rows
 
 MAX_WORLDS = 1024
 """Names of worlds that one memory keeps."""
@@ -87,11 +87,6 @@ class Storage:
         """Return the weights version of the newest commit; 0 without one."""
         with self._tables.env.begin() as txn, txn.cursor(self._tables.db["commits"]) as cursor:
             return int(unpack(cursor.value())["weights_version"]) if cursor.last() else 0
-
-    def size(self) -> int:
-        """Return the number of samples in memory at the newest turn."""
-        with self._tables.env.begin() as txn:
-            return len(self._tables.alive(txn))
 
     def commit(self, episode: Episode) -> Accepted:
         """Write one submission, or recognise it as already written; on disk when this returns.

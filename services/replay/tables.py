@@ -32,13 +32,14 @@ import numpy as np
 import numpy.typing as npt
 
 from services.replay.footprint import Mapping
-from services.replay.numbering import Commit, Counters
+from services.replay.numbering import Counters
 from shared.config import MemoryConfig
 from shared.errors import ConfigError, DiskFull, StateError
 from shared.facts import IMAGE_SHAPE
 from shared.messages import NO_LINEAGE
 from shared.rl.memory import SAMPLE
 from shared.rl.retention.strategy import columns
+from shared.rl.turn import Commit
 
 SCHEMA = 6
 MAP_BYTES = 1 << 38

@@ -16,7 +16,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from services.replay.numbering import Commit
 from services.replay.storage import Storage, Submission
 from services.replay.tables import Position
 from shared.facts import ACTION_COUNT
@@ -26,7 +25,7 @@ from shared.rl.memory import ReplayMemory
 from shared.rl.predictor import Predictor
 from shared.rl.retention.strategy import strategy
 from shared.rl.schedule import Moment
-from shared.rl.turn import Maintenance, maintain
+from shared.rl.turn import Commit, maintain
 from shared.run_record import EPISODES, REPLAY_COLUMNS, STAGE, turn_columns
 from shared.service import TICK_S, Service, Stopped
 from shared.weights import WeightsFetcher
@@ -119,7 +118,12 @@ class TurnWorker(threading.Thread):
             self._recent.append(int(record["fitness"]))
             worlds = submission.rows["world"]
             world = memory.worlds[int(worlds[-1])] if len(worlds) else ""
-            row = self._row(commit, record, world, memory, done)
+            row = {
+                **_basic_row(commit, record),
+                "world": world,
+                **turn_columns(memory, done),
+                "seconds": round(time.monotonic() - self._began_s, 2),
+            }
             self._me.insist("write down an episode", lambda: self._metrics.write(row))
         position = self._me.insist(
             "keep a turn", lambda: self._storage.apply_turn(submission, memory, done)
@@ -155,40 +159,6 @@ class TurnWorker(threading.Thread):
         )
         self._notify()
 
-    def _row(
-        self,
-        commit: Commit,
-        record: dict[str, Any],
-        world: str,
-        memory: ReplayMemory,
-        done: Maintenance,
-    ) -> dict[str, int | float | str]:
-        return {
-            **self._basic_row(commit, record),
-            "world": world,
-            **turn_columns(memory, done),
-            "seconds": round(time.monotonic() - self._began_s, 2),
-        }
-
-    def _basic_row(self, commit: Commit, record: dict[str, Any]) -> dict[str, int | float | str]:
-        totals = record["totals"]
-        return {
-            "episode": commit.episode,
-            "stage": STAGE,
-            "robot": record["robot"],
-            "ended": record["ended"],
-            "bump": int(record["bump"]),
-            "fitness": record["fitness"],
-            "actions": record["actions"],
-            "total_actions": totals["actions"],
-            "bumps": totals["bumps"],
-            "laps_left": totals["laps_left"],
-            "laps_right": totals["laps_right"],
-            "longest_run_actions": totals["longest_run_actions"],
-            "samples": commit.stored,
-            "acting_version": record["weights_version"],
-        }
-
     def _restart_metrics(self) -> None:
         """Make the CSV agree with what is on disk: rows of unprocessed episodes come again."""
         processed = self.view.position.processed
@@ -203,5 +173,21 @@ class TurnWorker(threading.Thread):
             if not commit.episode:
                 continue
             self._recent.append(int(record["fitness"]))
-            rows.append({**written.get(commit.episode, {}), **self._basic_row(commit, record)})
+            rows.append({**written.get(commit.episode, {}), **_basic_row(commit, record)})
         self._metrics.restart(rows)
+
+
+def _basic_row(commit: Commit, record: dict[str, Any]) -> dict[str, int | float | str]:
+    """What the files of the memory tell of an episode, for its row of the table."""
+    totals = record["totals"]
+    counted = ("bumps", "laps_left", "laps_right", "longest_run_actions")
+    return {
+        "episode": commit.episode,
+        "stage": STAGE,
+        **{name: record[name] for name in ("robot", "ended", "fitness", "actions")},
+        "bump": int(record["bump"]),
+        "total_actions": totals["actions"],
+        **{name: totals[name] for name in counted},
+        "samples": commit.stored,
+        "acting_version": record["weights_version"],
+    }

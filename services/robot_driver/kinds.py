@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
 import logging
 from typing import NamedTuple
 
+from services.extras import import_installed
 from services.robot_driver.real.link import Link
 from services.robot_driver.robot import Robot, RobotFault
 from shared.config import Config
@@ -39,11 +39,7 @@ def make_robot(config: Config) -> Robot:
         ConfigError: A world that cannot be used, or a library that is not installed.
         RobotMissing: The real robot does not answer.
     """
-    kind = config.robot.kind
-    try:
-        return _simulated(config) if kind == "sim" else _real(config)
-    except ModuleNotFoundError as error:
-        raise _missing(kind, error) from error
+    return _simulated(config) if config.robot.kind == "sim" else _real(config)
 
 
 def make_link(config: Config) -> Link:
@@ -56,10 +52,7 @@ def make_link(config: Config) -> Link:
     kind = REAL.get(config.robot.kind)
     if kind is None:
         raise ConfigError(f"robot.kind: expected a real robot ({', '.join(REAL)}), got 'sim'")
-    try:
-        module = importlib.import_module(f"services.robot_driver.real.{kind.module}")
-    except ModuleNotFoundError as error:
-        raise _missing(config.robot.kind, error) from error
+    module = import_installed(f"services.robot_driver.real.{kind.module}", kind.extra)
     link: Link = getattr(module, kind.link)(config)
     return link
 
@@ -80,25 +73,14 @@ def _real(config: Config) -> Robot:
         raise RobotMissing(f"driver: {error}") from error
 
 
-def _missing(kind: str, error: ModuleNotFoundError) -> Exception:
-    """What to tell of a library that is not there."""
-    if (error.name or "").split(".")[0] in {"services", "shared"}:
-        return error
-    extra = REAL[kind].extra if kind in REAL else kind
-    return ConfigError(
-        f"driver: robot.kind {kind!r} needs the Python package {error.name}, which is not "
-        f"installed: pip install 'corridor[{extra}]'"
-    )
-
-
 def _simulated(config: Config) -> Robot:
+    import_installed("services.robot_driver.simulated.paced", "sim")
     from services.robot_driver.simulated.paced import PacedRobot
     from services.robot_driver.simulated.sim import SimRobot
-    from services.robot_driver.simulated.world import WorldError, load_world
+    from services.robot_driver.simulated.world import load_world
 
+    make = PacedRobot if config.robot.timing == "realtime" else SimRobot
     try:
-        world = load_world(config.robot.world)
-        robot = SimRobot(config.robot, world, config.run.seed)
-    except (WorldError, ValueError) as error:
+        return make(config.robot, load_world(config.robot.world), config.run.seed)
+    except (ConfigError, ValueError) as error:
         raise ConfigError(f"robot.world: {error}") from error
-    return PacedRobot(robot) if config.robot.timing == "realtime" else robot

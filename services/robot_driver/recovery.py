@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from services.robot_driver.host import Host
-from services.robot_driver.robot import STANDSTILL, ForwardingRobot, Pose, Robot, Velocity
+from services.robot_driver.robot import STANDSTILL, Base, Felt, Pose, Robot, Velocity
 from services.robot_driver.safety import Safety
 from shared.config import RobotConfig
 
@@ -18,7 +18,7 @@ class Halted(Exception):
     """An operator or the end of the service stopped the robot while it recovered."""
 
 
-class WatchedRobot(ForwardingRobot):
+class WatchedRobot(Base):
     """A robot during recovery: every command passes the limits, and an operator can stop it.
 
     `host.look` is called every `slice_s` while the robot moves; a motion ends by the robot's clock,
@@ -26,8 +26,11 @@ class WatchedRobot(ForwardingRobot):
     """
 
     def __init__(self, robot: Robot, safety: Safety, host: Host, slice_s: float | None) -> None:
-        super().__init__(robot)
-        self._safety, self._host, self._slice_s = safety, host, slice_s
+        self._robot, self._safety, self._host, self._slice_s = robot, safety, host, slice_s
+
+    def feel(self) -> Felt:
+        """Read odometry and bumper."""
+        return self._robot.feel()
 
     def drive(self, velocity: Velocity) -> None:
         """Drive what the limits leave of this velocity."""
@@ -61,7 +64,7 @@ LET_GO_M = 0.15
 """Farthest way back out of the contact that a motion by hand ended in."""
 
 
-def back_off(robot: Robot, config: RobotConfig, heading_rad: float) -> float:
+def back_off(robot: Base, config: RobotConfig, heading_rad: float) -> float:
     """Retreat at most `recovery_distance_m`, then turn on the spot to `heading_rad` (odometry).
 
     A wall behind ends the retreat; the robot then creeps forward half the way it had won, so that
@@ -88,7 +91,7 @@ def back_off(robot: Robot, config: RobotConfig, heading_rad: float) -> float:
     return _distance(start, here)
 
 
-def let_go(robot: Robot, config: RobotConfig, direction: float) -> None:
+def let_go(robot: Base, config: RobotConfig, direction: float) -> None:
     """Creep straight until the bumper is free, at most `LET_GO_M`; stand still then.
 
     Args:
@@ -112,7 +115,7 @@ def _creeping(config: RobotConfig) -> float:
     return min(config.recovery_speed_m_s, config.max_speed_m_s)
 
 
-def _move(robot: Robot, config: RobotConfig, distance_m: float) -> bool:
+def _move(robot: Base, config: RobotConfig, distance_m: float) -> bool:
     """Drive straight, backwards if negative; return whether a wall on that side ended it."""
     left = abs(distance_m)
     speed = _creeping(config)

@@ -89,15 +89,8 @@ class ChangeableWorld(Protocol):
         """Stand at a start of another world. Raises ValueError, nothing changed."""
 
 
-class Robot(ABC):
-    """A mobile base with one camera and a ring bumper: everything a driver asks of it.
-
-    Laps, faults and a world to change have defaults, for robots that know of none.
-    """
-
-    @abstractmethod
-    def sense(self) -> Sensed:
-        """Read camera, odometry and bumper now. Raises RobotFault when a sensor cannot be read."""
+class Base(ABC):
+    """What moves and feels: all that a recovery asks of a robot."""
 
     @abstractmethod
     def feel(self) -> Felt:
@@ -114,6 +107,17 @@ class Robot(ABC):
         Returns whether there was contact at any time. With `stop_on_contact` the velocity becomes
         zero at the first contact and the rest of the time passes standing still.
         """
+
+
+class Robot(Base):
+    """A mobile base with one camera and a ring bumper: everything a driver asks of it.
+
+    Laps, faults and a world to change have defaults, for robots that know of none.
+    """
+
+    @abstractmethod
+    def sense(self) -> Sensed:
+        """Read camera, odometry and bumper now. Raises RobotFault when a sensor cannot be read."""
 
     @abstractmethod
     def now_s(self) -> float:
@@ -145,60 +149,6 @@ class Robot(ABC):
     def changeable(self) -> ChangeableWorld | None:
         """The robot's world, if it can be changed."""
         return None
-
-
-class ForwardingRobot(Robot):
-    """A robot that passes everything on to another; subclasses replace what they do otherwise."""
-
-    def __init__(self, robot: Robot) -> None:
-        self._robot = robot
-
-    def sense(self) -> Sensed:
-        """Read the other robot's sensors."""
-        return self._robot.sense()
-
-    def feel(self) -> Felt:
-        """Read the other robot's odometry and bumper."""
-        return self._robot.feel()
-
-    def drive(self, velocity: Velocity) -> None:
-        """Set the other robot's velocity."""
-        self._robot.drive(velocity)
-
-    def run(self, duration_s: float, *, stop_on_contact: bool) -> bool:
-        """Let time pass for the other robot."""
-        return self._robot.run(duration_s, stop_on_contact=stop_on_contact)
-
-    def now_s(self) -> float:
-        """The other robot's clock."""
-        return self._robot.now_s()
-
-    def state(self) -> dict[str, float | int | str]:
-        """The other robot's state."""
-        return self._robot.state()
-
-    def restore(self, state: dict[str, float | int | str]) -> None:
-        """Restore the other robot."""
-        self._robot.restore(state)
-
-    def close(self) -> None:
-        """Close the other robot."""
-        self._robot.close()
-
-    @property
-    def laps(self) -> Laps:
-        """The other robot's laps."""
-        return self._robot.laps
-
-    @property
-    def faults(self) -> Counter[str]:
-        """The other robot's faults."""
-        return self._robot.faults
-
-    @property
-    def changeable(self) -> ChangeableWorld | None:
-        """The other robot's world, if it can be changed."""
-        return self._robot.changeable
 
 
 class RobotFault(Exception):

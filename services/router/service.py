@@ -7,13 +7,12 @@ apart.
 from __future__ import annotations
 
 import logging
-import signal
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
 from services.security.use import refuse_open_door
 from shared.bus import open_router
+from shared.threads import stop_on_signals
 
 TICK_S = 0.2
 """Python takes up a signal only where its main thread runs, and the signal may wake another one."""
@@ -35,14 +34,10 @@ def run(
     """
     refuse_open_door(endpoint, credentials, insecure)
     file = Path(credentials) / "router.json5" if credentials else None
-    stop = threading.Event()
-
-    def on_signal(*_: object) -> None:
-        stop.set()
-
-    signal.signal(signal.SIGTERM, on_signal)
-    signal.signal(signal.SIGINT, on_signal)
-    with open_router(endpoint, file, shared_memory=shared_memory) as locator:
+    with (
+        stop_on_signals() as stop,
+        open_router(endpoint, file, shared_memory=shared_memory) as locator,
+    ):
         log.info("router listens on %s", locator)
         announce(locator)
         while not stop.wait(TICK_S):

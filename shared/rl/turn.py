@@ -7,7 +7,7 @@ publish. The replay service and the single-process loop both call these.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -33,29 +33,18 @@ class Maintenance:
     equalised: bool
 
 
-class Numbered(Protocol):
-    """The numbers that replay gave a submission."""
+@dataclass(frozen=True)
+class Commit:
+    """One accepted submission: its numbers and what of it is stored."""
 
-    @property
-    def commit(self) -> int:
-        """Number of the submission."""
-
-    @property
-    def episode(self) -> int:
-        """The global episode number e; 0 while the memory is filled."""
-
-    @property
-    def first_id(self) -> int:
-        """Insertion number of the first sample."""
-
-    @property
-    def stored(self) -> int:
-        """How many samples are stored, from the first."""
+    commit: int
+    episode: int
+    """Global episode number; 0 for fill submissions."""
+    first_id: int
+    stored: int
 
 
-def sample_rows(
-    episode: Episode, worlds: list[str], numbers: Numbered
-) -> tuple[np.ndarray, Images]:
+def sample_rows(episode: Episode, worlds: list[str], numbers: Commit) -> tuple[np.ndarray, Images]:
     """Return the stored samples of an episode as rows and images for a `ReplayMemory`.
 
     worlds: names that the rows' column points into; it grows as needed.

@@ -11,6 +11,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+from services.robot_driver.real.odometry import between
 from services.robot_driver.robot import STANDSTILL, Pose, Velocity
 
 STEP_S = 0.02
@@ -138,11 +139,7 @@ class EmulatedBase:
     @property
     def odometry(self) -> Pose:
         """The way from where the base was switched on; wheels do not slip."""
-        start, here = self._start, self.body.pose
-        dx, dy = here.x_m - start.x_m, here.y_m - start.y_m
-        c, s = math.cos(start.heading_rad), math.sin(start.heading_rad)
-        turn = math.remainder(here.heading_rad - start.heading_rad, 2.0 * math.pi)
-        return Pose(c * dx + s * dy, c * dy - s * dx, turn)
+        return between(self._start, self.body.pose)
 
     @property
     def contact(self) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Self
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from shared.errors import first_problem
 
@@ -13,6 +13,10 @@ class FaultSet(BaseModel):
     """What is wrong with a robot or with the way to it. Frozen; the defaults are a sound one."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    battery_low: bool = False
+    scale: float = Field(default=1.0, ge=0.5, le=2.0)
+    """Part of a command that the wheels make of it."""
 
     def changed(self, changes: object) -> Self:
         """These with some values replaced; an empty text mends. Raises ValueError in one line."""

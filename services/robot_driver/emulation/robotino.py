@@ -55,7 +55,8 @@ class EmulatedRobotino:
         camera = camera_of(VERTICAL_FOV_DEG, WIDTH / HEIGHT)
         self.robot = EmulatedRobot(world, ROBOTINO, shape.model_copy(update={"camera": camera}))
         self._lock = threading.Lock()
-        self._faults = faults
+        self.faults = faults
+        """What is wrong now."""
         self._last: dict[str, bytes] = {}
         """Answers that are repeated once they are frozen."""
         self._asked_s = -math.inf
@@ -63,22 +64,17 @@ class EmulatedRobotino:
             odometry=faults.odometry, watchdog_s=faults.watchdog_s, scale=faults.scale
         )
 
-    @property
-    def faults(self) -> Faults:
-        """What is wrong now."""
-        return self._faults
-
     def change(self, body: bytes) -> Faults:
         """Change faults by a JSON object. Raises ValueError."""
         with self._lock:
-            self._faults = self._faults.changed(json.loads(body))
-            now = self._faults
+            self.faults = self.faults.changed(json.loads(body))
+            now = self.faults
             self.robot.configure(odometry=now.odometry, watchdog_s=now.watchdog_s, scale=now.scale)
             return now
 
     def get(self, path: str) -> Reply:
         """Answer a GET."""
-        faults = self._faults
+        faults = self.faults
         if path == "/cam0":
             return self._camera(faults)
         if path == "/data/bumper":
@@ -105,7 +101,7 @@ class EmulatedRobotino:
 
     def drive(self, method: str, body: bytes) -> Reply:
         """Answer a PUT or POST of a velocity."""
-        faults = self._faults
+        faults = self.faults
         if faults.commands == "refused":
             return HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", b"busy"
         try:
@@ -175,18 +171,11 @@ class Handler(BaseHTTPRequestHandler):
         elif self._reachable():
             self._reply(self.robotino.get(path))
 
-    def do_PUT(self) -> None:
-        """Commands."""
-        self._command()
-
-    def do_POST(self) -> None:
-        """Commands, and changes of faults."""
-        self._command()
-
     def log_message(self, format: str, *args: Any) -> None:
         """Keep quiet: forty requests a second."""
 
-    def _command(self) -> None:
+    def do_POST(self) -> None:
+        """Commands, and changes of faults."""
         path = urlsplit(self.path).path
         length = self.headers.get("Content-Length", "0")
         size = int(length) if length.isdecimal() else MAX_BODY + 1
@@ -202,6 +191,8 @@ class Handler(BaseHTTPRequestHandler):
                 self._reply(self.robotino.drive(self.command, body))
             else:
                 self._reply((HTTPStatus.NOT_FOUND, "text/plain", b"not found"))
+
+    do_PUT = do_POST  # noqa: N815
 
     def _changed(self, body: bytes) -> Reply:
         try:

@@ -20,7 +20,6 @@ class Faults(FaultSet):
     constant: the same pose in new readings."""
     camera: Literal["", "frozen", "500", "truncated", "empty", "noiseless", "flat"] = ""
     """noiseless: equal pictures where it stands; flat: one grey alone."""
-    battery_low: bool = False
     stall_s: float = Field(default=0.0, ge=0.0, le=10.0)
     """Every answer comes so much later."""
     network: Literal["", "cut", "silent", "reset"] = ""
@@ -29,7 +28,5 @@ class Faults(FaultSet):
     """refused: status 503 for velocities alone."""
     post_ignored: bool = False
     """As old images do: POST is answered and does nothing, PUT works."""
-    scale: float = Field(default=1.0, ge=0.5, le=2.0)
-    """Part of a command that the wheels make of it."""
     watchdog_s: float = Field(default=ROBOTINO.watchdog_s, gt=0.0, le=5.0)
     """Time after which the base stops by itself: 0.2 s as documented, 0.5 s in older sources."""

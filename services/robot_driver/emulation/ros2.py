@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import json
 import math
-import signal
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import replace
 from typing import Any
 
@@ -34,6 +33,7 @@ from shared.config import RobotConfig
 from shared.errors import BadMessage, ConfigError, RouterMissing
 from shared.facts import IMAGE_HEIGHT, IMAGE_WIDTH
 from shared.foreign_bus import RawInbox, RawSample
+from shared.threads import stop_on_signals
 
 PERIODS_S = {"odometry": 0.05, "camera": 0.1, "bumper": 0.05, "battery": 0.5}
 DUPLICATE_S = 1.0
@@ -61,6 +61,11 @@ class EmulatedRos2:
         ConfigError: It cannot listen there, or there is no such world.
     """
 
+    faults: Ros2Faults
+    """What is wrong now."""
+    endpoint: str
+    """Where it listens."""
+
     def __init__(self, config: RobotConfig, world: str, listen: str, faults: Ros2Faults) -> None:
         self._ros = config.ros2
         create3 = self._ros.bumper_type == "HazardDetectionVector"
@@ -75,7 +80,7 @@ class EmulatedRos2:
         )
         self.counts: Counter[str] = Counter()
         """Commands that came, and those refused, by why."""
-        self._faults = Ros2Faults()
+        self.faults = Ros2Faults()
         self._lock = threading.RLock()
         self._inbox = RawInbox()
         self._network: Network | None = None
@@ -87,9 +92,9 @@ class EmulatedRos2:
         self._close_s, self._reopen_s = math.inf, -math.inf
         self._last_command_ns = 0
         try:
-            self._listen = listen
+            self.endpoint = listen
             self._network = self._opened()
-            self._listen = self._network.endpoint
+            self.endpoint = self._network.endpoint
         except BaseException:
             self.robot.close()
             raise
@@ -102,26 +107,16 @@ class EmulatedRos2:
         for thread in self._threads:
             thread.start()
 
-    @property
-    def endpoint(self) -> str:
-        """Where it listens."""
-        return self._listen
-
-    @property
-    def faults(self) -> Ros2Faults:
-        """What is wrong now."""
-        return self._faults
-
     def change(self, changes: object) -> Ros2Faults:
         """Change some faults. Raises ValueError in one line."""
         with self._lock:
-            before, now = self._faults, self._faults.changed(changes)
-            self._faults = now
+            before, now = self.faults, self.faults.changed(changes)
+            self.faults = now
             self.robot.configure(odometry=now.odometry, watchdog_s=now.watchdog_s, scale=now.scale)
             if now.closed_s:  # after this was answered
                 self._close_s = time.monotonic() + STEP_S
                 self._reopen_s = self._close_s + now.closed_s
-                self._faults = now.changed({"closed_s": 0.0})
+                self.faults = now.changed({"closed_s": 0.0})
             elif self._network is not None and before != now:
                 self._network.listen(self._velocity_type)
                 self._network.show_bumper(now.bumper != "silent")
@@ -148,15 +143,15 @@ class EmulatedRos2:
     @property
     def _velocity_type(self) -> VelocityType | None:
         """What the base listens for now."""
-        if self._faults.nobody_listens:
+        if self.faults.nobody_listens:
             return None
-        stamped = (self._ros.velocity_type == "TwistStamped") != self._faults.wrong_type
+        stamped = (self._ros.velocity_type == "TwistStamped") != self.faults.wrong_type
         return "TwistStamped" if stamped else "Twist"
 
     def _opened(self) -> Network:
-        network = Network(self._listen, self._ros, self._inbox)
+        network = Network(self.endpoint, self._ros, self._inbox)
         network.listen(self._velocity_type)
-        network.show_bumper(self._faults.bumper != "silent")
+        network.show_bumper(self.faults.bumper != "silent")
         self._told_pressed = None
         return network
 
@@ -227,7 +222,7 @@ class EmulatedRos2:
 
     def _tell(self, name: str) -> None:
         with self._lock:
-            faults = self._faults
+            faults = self.faults
         state = getattr(faults, name, "")
         if state in ("silent", "muted"):
             return
@@ -297,20 +292,14 @@ class EmulatedRos2:
         return cdr.encode_compressed_image(jpeg, stamp_ns, form="rgb8; jpeg compressed bgr8")
 
     def _now_ns(self) -> int:
-        return time.time_ns() + CLOCK_OFFSET_NS + round(self._faults.clock_step_s * 1e9)
+        return time.time_ns() + CLOCK_OFFSET_NS + round(self.faults.clock_step_s * 1e9)
 
 
 def run(
     config: RobotConfig, world: str, listen: str, faults: Ros2Faults, ready: Callable[[str], None]
 ) -> None:
     """Be a ROS 2 robot until Ctrl-C or SIGTERM; `ready` is called with the endpoint."""
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
-    emulated = EmulatedRos2(config, world, listen, faults)
-    try:
-        ready(emulated.endpoint)
+    with stop_on_signals() as stop, closing(EmulatedRos2(config, world, listen, faults)) as robot:
+        ready(robot.endpoint)
         while not stop.wait(0.2):  # a signal that another thread got is taken up only here
             pass
-    finally:
-        emulated.close()

@@ -41,13 +41,10 @@ class Ros2Faults(FaultSet):
     """Every message comes a second time, a second later."""
     bare: bool = False
     """rmw_zenoh: messages come without their attachment."""
-    battery_low: bool = False
     clock_step_s: float = Field(default=0.0, ge=-3600.0, le=3600.0)
     """The robot's clock is set by so much."""
     closed_s: float = Field(default=0.0, ge=0.0, le=60.0)
     """Leave the network for this time, then come back."""
-    scale: float = Field(default=1.0, ge=0.5, le=2.0)
-    """Part of a command that the wheels make of it."""
     watchdog_s: float = Field(default=CREATE3.watchdog_s, gt=0.0, le=5.0)
     """Time after which the base stops by itself."""
 

@@ -85,15 +85,7 @@ class Network:
 
     def _key(self, topic: str, kind: str) -> str:
         full = ros2_names.full_topic(self._ros.namespace, topic)
-        if self._ros.transport == "bridge":
-            return full
-        return ros2_names.rmw_key(
-            self._ros.domain, full, ros2_types.FULL_NAMES[kind], self._hash(kind)
-        )
-
-    def _hash(self, kind: str) -> str:
-        humble = self._ros.distribution == "humble"
-        return ros2_names.NO_HASH if humble else ros2_types.type_hash(kind)
+        return ros2_types.key_of(self._ros, full, kind)
 
     def _announce(
         self, direction: Literal["publishes", "listens"], topic: str, kind: str
@@ -109,7 +101,7 @@ class Network:
                 self._bus.zid,
                 self._entities,
                 endpoint,
-                self._hash(kind),
+                ros2_types.type_hash(kind, self._ros.distribution),
                 "emulator",
             )
         )

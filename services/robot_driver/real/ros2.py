@@ -65,12 +65,13 @@ class Ros2Link(Ros2Sensors):
                 bus.subscribe(
                     self._inbox,
                     name,
-                    self._key(name, kind, ros2_names.ANY_HASH),
+                    ros2_types.key_of(self._ros, self._topics[name], kind, ros2_names.ANY_HASH),
                     max_bytes=ros2_types.MAX_BYTES[kind],
                     keep=KEPT[name],
                 )
         for kind in ros2_names.VELOCITY_TYPES:
-            self._publishers[kind] = bus.publisher(self._key("velocity", kind, self._hash(kind)))
+            key = ros2_types.key_of(self._ros, self._topics["velocity"], kind)
+            self._publishers[kind] = bus.publisher(key)
         self._thread.start()
 
     def obstacle(self) -> str:
@@ -118,17 +119,6 @@ class Ros2Link(Ros2Sensors):
             self._bus.close()
 
     # ------------------------------------------------------------ names and types
-
-    def _hash(self, kind: str) -> str:
-        if self._ros.distribution == "humble":
-            return ros2_names.NO_HASH
-        return ros2_types.type_hash(kind)
-
-    def _key(self, name: str, kind: str, type_hash: str) -> str:
-        topic = self._topics[name]
-        if self._ros.transport == "bridge":
-            return topic
-        return ros2_names.rmw_key(self._ros.domain, topic, ros2_types.FULL_NAMES[kind], type_hash)
 
     def _velocity_type(self) -> tuple[VelocityType, str]:
         """Which type to send (empty: unknown), and what speaks against sending."""

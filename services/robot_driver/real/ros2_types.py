@@ -7,12 +7,16 @@ checked. Stamps are nanoseconds of the robot's clock; 0: none told.
 from __future__ import annotations
 
 import functools
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from services.robot_driver.real import ros2_names
 from shared.errors import BadMessage
+
+if TYPE_CHECKING:
+    from shared.config import Ros2Config
 
 VelocityType = Literal["Twist", "TwistStamped"]
 CameraType = Literal["Image", "CompressedImage"]
@@ -62,9 +66,19 @@ _ENCAPSULATIONS = (b"\x00\x00", b"\x00\x01")
 _S_NS = 1_000_000_000
 
 
-def type_hash(kind: str) -> str:
+def type_hash(kind: str, distribution: str = "jazzy") -> str:
     """`RIHS01_...` of a type by its short name, as rmw_zenoh has it in its keys."""
+    if distribution == "humble":
+        return ros2_names.NO_HASH
     return str(_store().hash_rihs01(FULL_NAMES[kind]))
+
+
+def key_of(ros: Ros2Config, topic: str, kind: str, hashed: str = "") -> str:
+    """Key of a topic, its namespace included, by the short name of its type; hashed: its hash."""
+    if ros.transport == "bridge":
+        return topic
+    hashed = hashed or type_hash(kind, ros.distribution)
+    return ros2_names.rmw_key(ros.domain, topic, FULL_NAMES[kind], hashed)
 
 
 @functools.cache

@@ -66,21 +66,17 @@ class SimRobot(Robot):
         self.seed = seed
         self.obstacles = world.obstacles
         """What stands in the world now, in the order in which it was placed."""
-        self._pose = _pose_of(world.starts[0])
+        self.pose = _pose_of(world.starts[0])
+        """Where the robot is; without the cost of a picture."""
         self._velocity = STANDSTILL
         self._time_s = 0.0
         self._laps = LapCounter()
         self._scene = self._at_start(world, 0)
 
     @property
-    def pose(self) -> Pose:
-        """Where the robot is; without the cost of a picture."""
-        return self._pose
-
-    @property
     def contact(self) -> bool:
         """The ring bumper is pressed now, anywhere on the ring."""
-        return self._clearance(self._pose) <= SKIN_M
+        return self._clearance(self.pose) <= SKIN_M
 
     @property
     def laps(self) -> Laps:
@@ -94,7 +90,7 @@ class SimRobot(Robot):
 
     def frame(self, width_px: int = 0, height_px: int = 0) -> npt.NDArray[np.uint8]:
         """The camera picture before preprocessing: uint8 [h, w, 3], RGB."""
-        return self.look_from(self._pose, width_px, height_px)
+        return self.look_from(self.pose, width_px, height_px)
 
     def look_from(self, pose: Pose, width_px: int = 0, height_px: int = 0) -> npt.NDArray[np.uint8]:
         """What the camera would see from another pose; the robot stays where it is."""
@@ -102,11 +98,11 @@ class SimRobot(Robot):
 
     def sense(self) -> Sensed:
         """Camera, pose and bumper now."""
-        return Sensed(self._pose, self.contact, preprocess(self.frame()))
+        return Sensed(self.pose, self.contact, preprocess(self.frame()))
 
     def feel(self) -> Felt:
         """Pose and bumper now, without a picture."""
-        return Felt(self._pose, self.contact)
+        return Felt(self.pose, self.contact)
 
     def drive(self, velocity: Velocity) -> None:
         """Set the body velocity that holds until the next call."""
@@ -121,7 +117,7 @@ class SimRobot(Robot):
         """
         steps = self._substeps(duration_s)
         touched = False
-        free = self._clearance(self._pose)
+        free = self._clearance(self.pose)
         for _ in range(steps):
             if not self._velocity.moving:
                 break
@@ -147,7 +143,7 @@ class SimRobot(Robot):
         self.world.check_placing(obstacle, [other.name for other in self.obstacles])
         obstacles = (*self.obstacles, obstacle)
         complaint = f"obstacle {obstacle.name!r} would overlap the robot"
-        self._show(self._built(self.world, obstacles, self._pose, GAP_M, complaint))
+        self._show(self._built(self.world, obstacles, self.pose, GAP_M, complaint))
         self.obstacles = obstacles
 
     def remove(self, name: str) -> None:
@@ -168,7 +164,7 @@ class SimRobot(Robot):
         world.check_start(start)
         self._show(self._at_start(world, start))
         self.world, self.obstacles = world, world.obstacles
-        self._pose, self._velocity = _pose_of(world.starts[start]), STANDSTILL
+        self.pose, self._velocity = _pose_of(world.starts[start]), STANDSTILL
         self._laps = LapCounter(left=self._laps.left, right=self._laps.right)
 
     def state(self) -> dict[str, float | int | str]:
@@ -177,9 +173,9 @@ class SimRobot(Robot):
             "world": self.world.name,
             "world_fingerprint": self.world.fingerprint,
             "obstacles": json.dumps([obstacle.model_dump() for obstacle in self.obstacles]),
-            "x_m": self._pose.x_m,
-            "y_m": self._pose.y_m,
-            "heading_rad": self._pose.heading_rad,
+            "x_m": self.pose.x_m,
+            "y_m": self.pose.y_m,
+            "heading_rad": self.pose.heading_rad,
             "forward_m_s": self._velocity.forward_m_s,
             "left_m_s": self._velocity.left_m_s,
             "turn_rad_s": self._velocity.turn_rad_s,
@@ -208,7 +204,7 @@ class SimRobot(Robot):
         winding_rad, lap_start_rad = _number(state, "winding_rad"), _number(state, "lap_start_rad")
         left, right = int(_number(state, "laps_left")), int(_number(state, "laps_right"))
         self._put(world, obstacles, pose)
-        self._pose, self._velocity = pose, velocity
+        self.pose, self._velocity = pose, velocity
         self._time_s = time_s
         self._laps = LapCounter(winding_rad, lap_start_rad, left, right)
 
@@ -235,7 +231,7 @@ class SimRobot(Robot):
 
     def _substep(self, duration_s: float, free: float) -> float:
         """Move as far as walls allow; return a lower bound of the gap, exact near walls."""
-        before = self._pose
+        before = self.pose
         after = advance(before, self._velocity, duration_s)
         way = math.hypot(after.x_m - before.x_m, after.y_m - before.y_m)
         free -= way
@@ -243,7 +239,7 @@ class SimRobot(Robot):
             free = self._clearance(after)
         if free < GAP_M and way > 0.0:
             after, free = self._blocked(before, after)
-        self._pose = after
+        self.pose = after
         if self.world.lap is not None:
             self._laps.add(self.world.lap.centre, before, after)
         return free

@@ -39,11 +39,6 @@ LEAST_LOSS = 1e-3
 class LeastWorth(Strategy):
     """The samples of least worth go, of equal ones the older, until floor(0.99 N) remain."""
 
-    def renew(self, there: Situation) -> bool:
-        """Bring its own columns up to date; return whether any changed."""
-        del there
-        return False
-
     @abstractmethod
     def worth(self, there: Situation) -> Floats:
         """Return what each sample is worth: float64 [n]. The columns are up to date."""

@@ -41,11 +41,6 @@ class MostAlike(Strategy):
     Of pairs that are equally alike the one goes whose older sample is the oldest.
     """
 
-    def renew(self, there: Situation) -> bool:
-        """Bring its own columns up to date; return whether any changed."""
-        del there
-        return False
-
     @abstractmethod
     def distances(self, there: Situation) -> Distances:
         """Return what computes distances. The columns are up to date."""

@@ -75,6 +75,10 @@ class Strategy(ABC):
         """Return the numbers to keep that the first discard begins with."""
         return {}
 
+    def renew(self, there: Situation) -> bool:
+        """Bring its own columns up to date, for `choose`; return whether any changed."""
+        return False
+
     def prepare(self, there: Situation) -> bool:
         """Change its own columns, whether or not the memory is full; return whether it did."""
         return False

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from builders import command, make_observation
 from fakes import message
+from forwarding import ForwardingRobot
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -16,7 +17,7 @@ from services.commander.commander import refuse_others
 from services.commander.drive import DriveTally
 from services.robot_driver.driver import Driver
 from services.robot_driver.motion_control import motion_velocity
-from services.robot_driver.robot import STANDSTILL, Felt, ForwardingRobot, Velocity
+from services.robot_driver.robot import STANDSTILL, Felt, Velocity
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import load_world
 from shared.config import Config

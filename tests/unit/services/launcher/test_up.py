@@ -9,7 +9,7 @@ import pytest
 
 CODE = """
 import signal
-from services.launcher.up import stop_on_signals
+from shared.threads import stop_on_signals
 before = signal.{before}
 signal.signal(signal.SIGHUP, before)
 with stop_on_signals() as stop:

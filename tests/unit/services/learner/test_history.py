@@ -151,7 +151,7 @@ class Learner:
             for _ in range(5):
                 try:
                     return attempt()
-                except PeerSilent:
+                except (PeerSilent, BadMessage):
                     if states and reached(states[-1]):
                         raise Stopped(what) from None
             raise AssertionError(f"no answer: {what}")

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.replay.numbering import (
-    Commit,
     Counters,
     accept,
     filling,
@@ -21,6 +20,7 @@ from services.replay.numbering import (
 )
 from shared.config import MemoryConfig
 from shared.errors import StateError
+from shared.rl.turn import Commit
 
 FAST = settings(deadline=None, max_examples=60, derandomize=True)
 CONFIG = MemoryConfig(capacity=30)

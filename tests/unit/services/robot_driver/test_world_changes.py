@@ -8,6 +8,7 @@ import msgpack
 import numpy as np
 import pytest
 from builders import FakePredictor, make_config
+from forwarding import ForwardingRobot
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -18,7 +19,6 @@ from services.robot_driver.robot import (
     STANDSTILL,
     ChangeableWorld,
     Felt,
-    ForwardingRobot,
     Pose,
     Robot,
     Sensed,
