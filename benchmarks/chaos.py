@@ -22,16 +22,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from benchmarks.chaos_events import (
-    MOVABLE,
-    PROCESSES,
-    RELEASES,
-    ROBOTS,
-    ROLES,
-    SECOND,
-    Event,
-    draw,
-)
+from benchmarks.chaos_events import MOVABLE, PROCESSES, RELEASES, ROBOTS, ROLES, SECOND, Event, draw
 from benchmarks.cluster import Cluster, make_config
 from benchmarks.frame import Bar, report, table
 from benchmarks.invariants import Checker

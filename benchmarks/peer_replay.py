@@ -72,11 +72,7 @@ class Ours:
         """Images, actions and rewards of a mini-batch."""
         drawn = self._draw()
         images = np.frombuffer(drawn.images, np.uint8).reshape(-1, *IMAGE_SHAPE)
-        return (
-            images,
-            np.frombuffer(drawn.actions, np.uint8),
-            np.frombuffer(drawn.rewards, "<f4"),
-        )
+        return (images, np.frombuffer(drawn.actions, np.uint8), np.frombuffer(drawn.rewards, "<f4"))
 
     def wait_for(self, change: int) -> None:
         """Wait until the memory has this change: until then turns are made."""

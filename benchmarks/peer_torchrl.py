@@ -33,9 +33,7 @@ def joined(name: str, port: int) -> None:
     """Become one of the two processes, connected by TCP: no shared memory."""
     warnings.filterwarnings("ignore", category=UserWarning, module=r"torch\.distributed")
     options = rpc.TensorPipeRpcBackendOptions(
-        num_worker_threads=THREADS,
-        init_method=f"tcp://127.0.0.1:{port}",
-        _transports=["uv"],
+        num_worker_threads=THREADS, init_method=f"tcp://127.0.0.1:{port}", _transports=["uv"]
     )
     rank = (CLIENT, SERVER).index(name)
     rpc.init_rpc(name, rank=rank, world_size=2, rpc_backend_options=options)

@@ -18,13 +18,7 @@ from functools import wraps
 from pathlib import Path
 from typing import Any
 
-from benchmarks.distribution import (
-    WARM_UP_STEPS,
-    Steps,
-    configuration,
-    connected,
-    more_robots,
-)
+from benchmarks.distribution import WARM_UP_STEPS, Steps, configuration, connected, more_robots
 from benchmarks.frame import Mode, mode_of, table
 from benchmarks.run_all import PAGE, renewed
 from experiments.single_process import SingleProcess

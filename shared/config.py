@@ -35,11 +35,7 @@ class Section(BaseModel):
     """Base of all sections: frozen, strict, unknown keys refused."""
 
     model_config = ConfigDict(
-        frozen=True,
-        extra="forbid",
-        strict=True,
-        allow_inf_nan=False,
-        use_attribute_docstrings=True,
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
 
 
@@ -129,8 +125,7 @@ class RobotinoConfig(Section):
     """A Festo Robotino 3 or 4 over its REST interface."""
 
     address: str = Field(
-        default="172.26.1.1:80",
-        pattern=r"^(\[[0-9A-Fa-f:]+\]|[A-Za-z0-9._-]+)(:[0-9]{1,5})?$",
+        default="172.26.1.1:80", pattern=r"^(\[[0-9A-Fa-f:]+\]|[A-Za-z0-9._-]+)(:[0-9]{1,5})?$"
     )
     """Host, or host:port."""
     camera_period_s: float = Field(default=0.1, gt=0.0, le=1.0)

@@ -178,9 +178,7 @@ class ForeignBus:
         client = mode == "client"
         try:
             config = zenoh_config(
-                mode,
-                connect=[endpoint] if client else [],
-                listen=[] if client else [endpoint],
+                mode, connect=[endpoint] if client else [], listen=[] if client else [endpoint]
             )
         except zenoh.ZError as error:
             raise ConfigError(

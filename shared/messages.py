@@ -75,11 +75,7 @@ class Message(BaseModel):
     """Base of all messages: frozen, strictly typed, unknown fields refused, no NaN."""
 
     model_config = ConfigDict(
-        frozen=True,
-        extra="forbid",
-        strict=True,
-        allow_inf_nan=False,
-        use_attribute_docstrings=True,
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
 
 

@@ -94,12 +94,7 @@ def table(world: str, found: Mapping[str, Figures]) -> Table:
 
 
 def _drive(
-    env: CorridorEnv,
-    make: Callable[[], Chooser],
-    starts: int,
-    actions: int,
-    name: str,
-    out: Path,
+    env: CorridorEnv, make: Callable[[], Chooser], starts: int, actions: int, name: str, out: Path
 ) -> Figures:
     """Drive from all starts; write the ways."""
     done = evaluate(env, make(), starts, actions)

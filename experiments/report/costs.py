@@ -68,9 +68,7 @@ def rates(runs: Sequence[RunFolder]) -> Rates | None:
 
 
 def full_scale(
-    experiments: Sequence[Experiment],
-    gpu_step_ms: float | None = None,
-    plans: Traversable = PLANS,
+    experiments: Sequence[Experiment], gpu_step_ms: float | None = None, plans: Traversable = PLANS
 ) -> Block:
     """The cost of every plan at full scale: measured where it was run, else projected.
 

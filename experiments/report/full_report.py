@@ -50,9 +50,7 @@ def write_report(
 
 
 def all_sections(
-    experiments: Sequence[Experiment],
-    gpu_step_ms: float | None = None,
-    plans: Traversable = PLANS,
+    experiments: Sequence[Experiment], gpu_step_ms: float | None = None, plans: Traversable = PLANS
 ) -> list[Section]:
     """The overview, the thesis's claims, comparisons, every experiment; nothing is drawn yet.
 

@@ -22,9 +22,7 @@ DRIVEN = {
 
 
 def overview(
-    experiments: Sequence[Experiment],
-    gpu_step_ms: float | None = None,
-    plans: Traversable = PLANS,
+    experiments: Sequence[Experiment], gpu_step_ms: float | None = None, plans: Traversable = PLANS
 ) -> Section:
     """Everything that was run, and what it cost.
 

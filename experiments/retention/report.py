@@ -21,14 +21,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from experiments.report.document import Block, Missing, Section, Table
 from experiments.report.measures import number
-from experiments.report.ratios import (
-    Drives,
-    common_seeds,
-    logs,
-    ratio_blocks,
-    ratio_table,
-    ratios,
-)
+from experiments.report.ratios import Drives, common_seeds, logs, ratio_blocks, ratio_table, ratios
 from experiments.retention.benchmark import Benchmark, load_benchmark
 from experiments.retention.work import Measured, Network
 from experiments.verdicts import Floats, interquartile_mean, log_rates, max_t

@@ -20,11 +20,7 @@ from shared.config import Config, Numerics
 from shared.errors import CorridorError, DiskFull
 from shared.inbox import Inbox
 from shared.keys import ACTOR_STATE, LEARNER_STATE, OBSERVATION
-from shared.messages import (
-    LearnerState,
-    Observation,
-    image_array,
-)
+from shared.messages import LearnerState, Observation, image_array
 from shared.numerics import settle
 from shared.rl.predictor import Predictor
 from shared.service import TICK_S, Service, Stopped, new_life, service

@@ -18,14 +18,7 @@ from shared.complaints import Complaints
 from shared.errors import BadMessage, PeerRefused, StateError
 from shared.facts import ACTION_COUNT
 from shared.keys import ACTION
-from shared.messages import (
-    Action,
-    ActorState,
-    Episode,
-    LearnerState,
-    Observation,
-    RobotProgress,
-)
+from shared.messages import Action, ActorState, Episode, LearnerState, Observation, RobotProgress
 from shared.rl.policy import Values
 from shared.service import Service, new_life
 from shared.weights import WeightsFetcher

@@ -27,8 +27,7 @@ if TYPE_CHECKING:
 DRIVING = ("pilot", "operator")
 """Credentials for driving: those of a pilot, who may send actions."""
 OneRobot = Annotated[
-    str | None,
-    typer.Option("--robot", help="Id of the robot; default: the only one of the run."),
+    str | None, typer.Option("--robot", help="Id of the robot; default: the only one of the run.")
 ]
 
 

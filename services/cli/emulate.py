@@ -11,8 +11,7 @@ from services.launcher.tether import tether
 from shared.errors import ConfigError
 
 emulate = typer.Typer(
-    help="Be a real robot's network interface in front of a simulated world.",
-    no_args_is_help=True,
+    help="Be a real robot's network interface in front of a simulated world.", no_args_is_help=True
 )
 World = Annotated[str, typer.Option(help="World that the robot drives in, such as plus.")]
 

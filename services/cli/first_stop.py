@@ -54,11 +54,7 @@ def send(arguments: Sequence[str]) -> FirstStop | None:
         return None
     try:
         session = zenoh.open(
-            zenoh_config(
-                "client",
-                connect=[target.endpoint],
-                credentials=target.credentials,
-            )
+            zenoh_config("client", connect=[target.endpoint], credentials=target.credentials)
         )
     except zenoh.ZError:
         return None

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from services.cli.options import EndpointOption, RunDirOption, Sources, default_folder, grouped
 from shared.errors import ConfigError
 
-if TYPE_CHECKING:
-    from shared.config import Config
-
 robot = typer.Typer(help="Look at a real robot, and measure it.", no_args_is_help=True)
+
+
+@robot.callback()
+def _robot() -> None:
+    """Look at a real robot, and measure it."""
+    logging.getLogger("services").addHandler(logging.NullHandler())  # faults are summed up
 
 
 def add_to(app: typer.Typer) -> None:
@@ -67,32 +71,18 @@ def robot_calibrate(
     is written if it touches something or if two measurements disagree.
     """
     from services.robot_driver.kinds import make_link
-    from services.robot_driver.real.hardware import HardwareRobot
-    from services.robot_driver.setup.calibrate import calibrate
+    from services.robot_driver.setup.calibrate import calibrated
+    from shared.provenance import commit
+    from shared.run_record import now_utc
     from shared.settings import preset_text
     from shared.statefile import write_atomically
 
     if out.exists():
         raise ConfigError(f"--out: {out} exists already")
-    loaded = sources.load()
-    link = make_link(loaded)
-    driven = HardwareRobot(loaded.robot, link)
-    try:
-        found = calibrate(loaded, driven, link, space_m, _made(loaded), typer.echo)
-    finally:
-        driven.close()
-    tree = loaded.robot.model_copy(update={"calibration": found})
-    calibrated = loaded.model_copy(update={"robot": tree})
-    head = f"# {found.made}\n# max_dist (Eq 3.2): {calibrated.max_distance_m:.3f} m\n\n"
-    write_atomically(out, (head + preset_text(calibrated)).encode())
+    config = sources.load()
+    name = f"{config.robot.kind} {config.robot.id}"
+    made = f"corridor robot calibrate, {name}, {now_utc()}, {commit()}"
+    found = calibrated(config, make_link(config), space_m, made, typer.echo)
+    head = f"# {made}\n# max_dist (Eq 3.2): {found.max_distance_m:.3f} m\n\n"
+    write_atomically(out, (head + preset_text(found)).encode())
     typer.echo(f"written to {out}: use it with --preset {out}")
-
-
-def _made(config: Config) -> str:
-    """Provenance of a measurement made now."""
-    from shared.provenance import commit
-    from shared.run_record import now_utc
-
-    return (
-        f"corridor robot calibrate, {config.robot.kind} {config.robot.id}, {now_utc()}, {commit()}"
-    )

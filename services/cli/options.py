@@ -39,8 +39,7 @@ SetOption = Annotated[
     ),
 ]
 RunOption = Annotated[
-    str | None,
-    typer.Option(help="Name of the run (run.name).", rich_help_panel=CHOOSE),
+    str | None, typer.Option(help="Name of the run (run.name).", rich_help_panel=CHOOSE)
 ]
 RunDirOption = Annotated[
     Path | None,
@@ -66,16 +65,13 @@ InsecureOption = Annotated[
     typer.Option("--insecure", help="Let the router listen beyond loopback without credentials."),
 ]
 SeedOption = Annotated[
-    int | None,
-    typer.Option(help="Seed of all random draws (run.seed).", rich_help_panel=OURS),
+    int | None, typer.Option(help="Seed of all random draws (run.seed).", rich_help_panel=OURS)
 ]
 TetheredOption = Annotated[
-    bool,
-    typer.Option("--tethered", hidden=True, help="Stop as soon as standard input closes."),
+    bool, typer.Option("--tethered", hidden=True, help="Stop as soon as standard input closes.")
 ]
 RobotOption = Annotated[
-    str | None,
-    typer.Option(help="Id of one robot; default: all robots of the run."),
+    str | None, typer.Option(help="Id of one robot; default: all robots of the run.")
 ]
 RobotsOption = Annotated[
     str | None,

@@ -33,8 +33,7 @@ GivenRouterOption = Annotated[
 OwnRouterOption = Annotated[
     str | None,
     typer.Option(
-        help="Where the own router listens; default: loopback, a free port.",
-        rich_help_panel=CHOOSE,
+        help="Where the own router listens; default: loopback, a free port.", rich_help_panel=CHOOSE
     ),
 ]
 

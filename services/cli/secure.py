@@ -26,8 +26,7 @@ NamesArgument = Annotated[
     ),
 ]
 FolderOption = Annotated[
-    Path,
-    typer.Option("--folder", envvar="CORRIDOR_CREDENTIALS", help="What `secure init` made."),
+    Path, typer.Option("--folder", envvar="CORRIDOR_CREDENTIALS", help="What `secure init` made.")
 ]
 HostOption = Annotated[
     list[str] | None,

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from services.launcher.supervisor import Ending, Supervisor
+from services.launcher.supervisor import Supervisor
 from services.launcher.up import child_specs, free_endpoint
 from services.monitor.running import locked
 from services.processes import DRIVER
@@ -77,6 +77,5 @@ def _wait_for_robot(config: Config, supervisor: Supervisor) -> None:
 
 def _poll(supervisor: Supervisor, done: threading.Event) -> None:
     """Restart what crashes; whoever commands the robot sees that it is silent meanwhile."""
-    ending: Ending | None = None
-    while ending is None and not done.wait(TICK_S):
-        ending = supervisor.poll()
+    while not done.wait(TICK_S) and supervisor.poll() is None:
+        pass

@@ -31,6 +31,7 @@ PROBE_S = 60.0
 """Longest that the import of a library may take."""
 PYTHONS = ((3, 11), (3, 14))
 """From the first to before the second."""
+SHARING = "only with bus.shared_memory"
 LIBRARIES = {
     "eclipse-zenoh": "",
     "pydantic": "",
@@ -58,26 +59,18 @@ class Finding:
 
 def examine(config: Config, folder: Path) -> Iterator[Finding]:
     """Look at everything. folder: where runs are written."""
-    yield _python()
+    fits = PYTHONS[0] <= sys.version_info[:2] < PYTHONS[1]
+    advice = "" if fits else "use Python 3.11, 3.12 or 3.13"
+    yield Finding("Python", platform.python_version(), "good" if fits else "bad", advice)
     cores = len(os.sched_getaffinity(0))
     yield _atleast("processor cores", cores, 2, "{:d}", "slow", "training and driving take turns")
-    yield _atleast(
-        "free memory",
-        _free_memory_bytes() / GIB,
-        1.5,
-        "{:.1f} GiB",
-        "bad",
-        "end other programs, or choose a smaller memory.capacity",
+    free_gib, room_mib = _free_memory_bytes() / GIB, _free_bytes(Path(SHARED)) / MIB
+    advice = "end other programs, or choose a smaller memory.capacity"
+    yield _atleast("free memory", free_gib, 1.5, "{:.1f} GiB", "bad", advice)
+    yield _atleast(SHARED, room_mib, 128, "{:.0f} MiB free", "slow", f"{SHARING}: shm_size")
+    yield _limit(
+        "lockable memory", resource.RLIMIT_MEMLOCK, 64 * MIB, "slow", f"{SHARING}: ulimit -l"
     )
-    yield _atleast(
-        SHARED,
-        _free_bytes(Path(SHARED)) / MIB,
-        128,
-        "{:.0f} MiB free",
-        "slow",
-        "messages between processes are copied; containers: shm_size",
-    )
-    yield _limit("lockable memory", resource.RLIMIT_MEMLOCK, 64 * MIB, "slow", "ulimit -l 65536")
     yield _limit("address space", resource.RLIMIT_AS, 64 * GIB, "bad", "ulimit -v unlimited")
     yield _limit("open files", resource.RLIMIT_NOFILE, 1024, "bad", "ulimit -n 4096")
     yield _disk(folder)
@@ -109,13 +102,6 @@ def _atleast(
     if value >= least:
         return Finding(what, found)
     return Finding(what, f"{found}, expected {form.format(least)}", otherwise, advice)
-
-
-def _python() -> Finding:
-    found = platform.python_version()
-    if PYTHONS[0] <= sys.version_info[:2] < PYTHONS[1]:
-        return Finding("Python", found)
-    return Finding("Python", found, "bad", "use Python 3.11, 3.12 or 3.13")
 
 
 def _limit(what: str, number: int, least: int, otherwise: Verdict, advice: str) -> Finding:
@@ -176,9 +162,7 @@ def _libraries() -> Iterator[Finding]:
             verdict: Verdict = "good" if extras else "bad"
             advice = "" if extras else f"pip install {package}"
             yield Finding(package, f"not installed (extra {extras})", verdict, advice)
-            continue
-        fault = _import_fault("zenoh" if package == "eclipse-zenoh" else package)
-        if fault:
+        elif fault := _import_fault("zenoh" if package == "eclipse-zenoh" else package):
             # What only makes it quicker is left out by itself.
             verdict = "slow" if package == "openvino" else "bad"
             yield Finding(package, f"{version}, {fault}", verdict, f"reinstall {package}")

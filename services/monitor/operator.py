@@ -17,13 +17,7 @@ from shared.facts import NAME
 from shared.halts.book import ALL
 from shared.halts.orders import RobotOrder, order
 from shared.keys import ROBOT_WORLD, STOP, Peer, Stream
-from shared.messages import (
-    Message,
-    ServiceReply,
-    StopService,
-    WorldChange,
-    WorldChanged,
-)
+from shared.messages import Message, ServiceReply, StopService, WorldChange, WorldChanged
 from shared.service import new_life
 from shared.threads import stop_on_signals
 

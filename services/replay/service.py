@@ -22,15 +22,7 @@ from shared.complaints import Complaints
 from shared.config import Config
 from shared.errors import DiskFull
 from shared.inbox import Inbox
-from shared.keys import (
-    CHANGES,
-    EPISODE,
-    MINI_BATCH,
-    PROGRESS,
-    REPLAY_STATE,
-    SNAPSHOT,
-    TURNS,
-)
+from shared.keys import CHANGES, EPISODE, MINI_BATCH, PROGRESS, REPLAY_STATE, SNAPSHOT, TURNS
 from shared.messages import (
     ChangesRequest,
     Episode,

@@ -181,9 +181,7 @@ class Authority:
 
 def _write_identity(folder: Path, made: Identity, authority: x509.Certificate) -> None:
     private = made.key.private_bytes(
-        serialization.Encoding.PEM,
-        serialization.PrivateFormat.PKCS8,
-        serialization.NoEncryption(),
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
     write_private(folder / "key.pem", private)
     write_private(folder / "cert.pem", pem(made.certificate).encode())

@@ -15,15 +15,7 @@ from shared.bus import Bus
 from shared.errors import PeerMissing
 from shared.halts.book import ALL, RELEASE_WITHIN_S, new_halt
 from shared.keys import HALT, RELEASE, Role
-from shared.messages import (
-    MAX_HALTS,
-    Deadline,
-    HaltKind,
-    Halts,
-    Message,
-    Release,
-    Standing,
-)
+from shared.messages import MAX_HALTS, Deadline, HaltKind, Halts, Message, Release, Standing
 
 REPEAT_S = 0.3
 """A halt that is not confirmed is sent again after this time."""

@@ -78,11 +78,7 @@ class Trial:
     # ---------------------------------------------------------------- commands
 
     def run(
-        self,
-        *command: str,
-        check: bool = True,
-        timeout_s: float = PATIENCE_S,
-        shown: bool = False,
+        self, *command: str, check: bool = True, timeout_s: float = PATIENCE_S, shown: bool = False
     ) -> str:
         """Run a command to its end; returns what it printed, unless `shown`. Raises Failed."""
         try:

@@ -155,8 +155,7 @@ def test_an_acknowledged_episode_that_is_not_stored_is_found(stored: list[Any], 
 
 
 @pytest.mark.parametrize(
-    ("first", "then"),
-    [(action(2, 0), action(1, 0)), (replay_state(4), replay_state(3))],
+    ("first", "then"), [(action(2, 0), action(1, 0)), (replay_state(4), replay_state(3))]
 )
 def test_what_is_told_never_becomes_less(first: Any, then: Any) -> None:
     checker = Checker([ROBOT])

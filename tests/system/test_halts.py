@@ -140,8 +140,7 @@ def test_a_release_that_comes_late_does_nothing(cluster: Cluster) -> None:
     (halt,) = told.halts
     cluster.freeze("driver")
     release = Release(
-        numbers=(halt.number,),
-        deadlines=(Deadline(life=told.life, until_s=told.clock_s + 2.0),),
+        numbers=(halt.number,), deadlines=(Deadline(life=told.life, until_s=told.clock_s + 2.0),)
     )
     inbox.ask_all(RELEASE, release, timeout_s=10.0)
     cluster.stall(2.5)

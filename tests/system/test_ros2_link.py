@@ -342,9 +342,7 @@ def pressed(link: Ros2Link) -> bool:
 
 def test_without_a_router_it_gives_up_in_time_and_says_where() -> None:
     config = real_time(
-        kind="ros2",
-        ros2={"endpoint": "tcp/127.0.0.1:1"},
-        hardware={"open_timeout_s": 0.2},
+        kind="ros2", ros2={"endpoint": "tcp/127.0.0.1:1"}, hardware={"open_timeout_s": 0.2}
     )
     link = Ros2Link(config)
     with pytest.raises(RobotFault, match=r"robot\.ros2\.endpoint"):

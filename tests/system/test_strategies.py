@@ -17,8 +17,7 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(200)]
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=[] if n in ALWAYS else pytest.mark.slow) for n in STRATEGIES],
+    "name", [pytest.param(n, marks=[] if n in ALWAYS else pytest.mark.slow) for n in STRATEGIES]
 )
 def test_it_does_the_same_through_the_services(name: str, run_name: str, tmp_path: Path) -> None:
     memory = {"strategy": name, "capacity": 60, "equalise_every": 5}

@@ -148,11 +148,7 @@ class _Sheet:
         _put(self.pixels, self.at(*place), words, rgb)
 
     def label(
-        self,
-        place: tuple[float, float],
-        words: str,
-        way: tuple[float, float],
-        rgb: Colour = _INK,
+        self, place: tuple[float, float], words: str, way: tuple[float, float], rgb: Colour = _INK
     ) -> None:
         """Words beside a place, in direction `way` from it (metres; right and up), with a rim."""
         (w, h), _ = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
 
 from services.robot_driver.motion_control import action_velocity
+from services.robot_driver.real.hardware import HardwareRobot
 from services.robot_driver.real.link import Link
-from services.robot_driver.robot import STANDSTILL, NotReady, Pose, Robot, Velocity
+from services.robot_driver.robot import STANDSTILL, NotReady, Pose, Robot, RobotFault, Velocity
 from services.robot_driver.setup.response import Response, response
 from shared.config import CalibrationConfig, Config
 from shared.errors import ConfigError, RobotMissing
@@ -88,6 +90,18 @@ def calibrate(
         if ACTIONS[action].turn:
             driver.compare(action, found)
     return found
+
+
+def calibrated(config: Config, link: Link, space_m: float, made: str, echo: Echo) -> Config:
+    """The configuration with what was measured. Raises as `calibrate`."""
+    try:
+        robot = HardwareRobot(config.robot, link)
+    except RobotFault as error:
+        raise RobotMissing(f"robot calibrate: {error}") from error
+    with closing(robot):
+        found = calibrate(config, robot, link, space_m, made, echo)
+    settings = config.robot.model_copy(update={"calibration": found})
+    return config.model_copy(update={"robot": settings})
 
 
 class _Drives:

@@ -6,7 +6,7 @@ of the last part of the way. The delay is the one with which such a base comes c
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,8 +21,7 @@ BENT = 0.1
 Floats = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Response:
+class Response(NamedTuple):
     """What a robot made of one command."""
 
     speed: float

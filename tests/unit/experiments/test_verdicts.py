@@ -11,15 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from experiments.verdicts import (
-    FLIPS,
-    Paired,
-    holm,
-    interquartile_mean,
-    log_rates,
-    max_t,
-    paired,
-)
+from experiments.verdicts import FLIPS, Paired, holm, interquartile_mean, log_rates, max_t, paired
 
 FAST = settings(deadline=None, max_examples=40, derandomize=True)
 seeds = st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=8)

@@ -358,8 +358,7 @@ def test_a_message_without_version_or_type_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["Action", "Message", "", "observation", None, 5, ("a",), "x" * 4096, "a\nb", "__v"],
+    "name", ["Action", "Message", "", "observation", None, 5, ("a",), "x" * 4096, "a\nb", "__v"]
 )
 def test_another_type_is_refused(name: Any) -> None:
     assert "got type" in refused({**fields_of(make_observation(1)), "t": name}, m.Observation)

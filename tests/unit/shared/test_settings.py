@@ -65,10 +65,7 @@ def test_every_preset_is_valid_and_lists_differences_only(name: str) -> None:
         ("memory.capacity=lots", ["memory.capacity: expected a valid integer, got 'lots'"]),
         ("memory.capacity=3", ["memory.capacity: expected greater than or equal to 30, got 3"]),
         ("memory.protect_terminal=1", ["memory.protect_terminal: expected a valid boolean, got 1"]),
-        (
-            "robot.kind=ros",
-            ["robot.kind: expected 'sim', 'robotino' or 'ros2', got 'ros'"],
-        ),
+        ("robot.kind=ros", ["robot.kind: expected 'sim', 'robotino' or 'ros2', got 'ros'"]),
         ("robot.speed_m_s=nan", ["robot.speed_m_s: expected a finite number, got nan"]),
         ("run.name=A/B", ["run.name: expected a text to match pattern", "got 'A/B'"]),
         ("network.filters=24", ["memory.strategy 'rmm' needs", "24", "memory.strategy: default"]),
@@ -168,8 +165,7 @@ def test_claim_lets_endpoint_length_and_robot_differ(tmp_path: Path) -> None:
     config = settings.load("demo")
     settings.claim(tmp_path, config)
     other = settings.load(
-        "demo",
-        overrides=["bus.endpoint=tcp/127.0.0.1:9", "run.episodes=5", "robot.id=two"],
+        "demo", overrides=["bus.endpoint=tcp/127.0.0.1:9", "run.episodes=5", "robot.id=two"]
     )
     assert settings.claim(tmp_path, other) == config
     assert [key for key, _, _ in settings.differences(config, other)] == [

@@ -204,9 +204,7 @@ def spoilt(kind: str) -> bytes:
     "kind", ["not finite", "other layout", "other width", "no metadata", "cut"]
 )
 def test_weights_that_do_not_fit_are_refused_and_the_old_ones_stay(
-    kind: str,
-    learner: tuple[Learner, weights.WeightsFetcher],
-    caplog: pytest.LogCaptureFixture,
+    kind: str, learner: tuple[Learner, weights.WeightsFetcher], caplog: pytest.LogCaptureFixture
 ) -> None:
     bus, fetcher = learner
     has(fetcher, 1)

@@ -18,14 +18,7 @@ from experiments.report.figures.style import PALETTE
 from experiments.report.full_report import all_sections
 from experiments.report.run_folder import Experiment, load
 from shared.errors import ConfigError
-from tests.synthetic_runs import (
-    experiment,
-    missing,
-    sentences,
-    titles,
-    write_probes,
-    write_run,
-)
+from tests.synthetic_runs import experiment, missing, sentences, titles, write_probes, write_run
 
 
 def compared(shown: Sequence[Experiment]) -> list[Section]:

@@ -115,6 +115,18 @@ def test_the_environment_is_read(
     assert tomllib.loads(capsys.readouterr().out)["memory"]["capacity"] == 100
 
 
+@pytest.mark.parametrize("command", [("check",), ("calibrate", "--out", "my.toml")])
+def test_a_robot_that_is_simulated_or_does_not_answer_is_not_looked_at(
+    command: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "expected a real robot" in refused(capsys, 2, "robot", *command)
+    there = ("robot.robotino.address=127.0.0.1:9", "robot.hardware.open_timeout_s=0.2")
+    options = [f"--set={setting}" for setting in there]
+    line = refused(capsys, 1, "robot", *command, "--preset", "robotino", *options)
+    assert "no answer from 127.0.0.1:9" in line
+    assert not Path("my.toml").exists()
+
+
 def ran(folder: Path, config: Config) -> None:
     """A folder in which a run of this configuration learnt something."""
     settings.claim(folder, config)
@@ -151,9 +163,7 @@ def test_without_a_router_commands_fail_in_one_line(
     assert ".rs:" not in line
 
 
-def test_a_missing_library_is_named_with_what_to_install(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_missing_library_is_named_with_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
     monkeypatch.delitem(sys.modules, "shared.rl.network", raising=False)
     with pytest.raises(

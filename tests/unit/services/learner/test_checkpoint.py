@@ -40,11 +40,7 @@ def train(trainer: Trainer, episodes: range) -> None:
 
 
 def state(trainer: Trainer) -> tuple[bytes, bytes, dict[str, int]]:
-    return (
-        to_bytes(trainer.train_network),
-        to_bytes(trainer.target_network),
-        trainer.counters(),
-    )
+    return (to_bytes(trainer.train_network), to_bytes(trainer.target_network), trainer.counters())
 
 
 @pytest.fixture

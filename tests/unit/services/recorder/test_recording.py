@@ -349,10 +349,7 @@ def test_lengths_that_no_file_has_are_refused(whole: Path, tmp_path: Path) -> No
 
 def test_a_recording_that_failed_does_not_look_complete(tmp_path: Path, turns: Any) -> None:
     path = tmp_path / "f.mcap"
-    with (
-        contextlib.suppress(OSError),
-        RecordingWriter(path, Origin(CONFIG, NUMERICS)) as writer,
-    ):
+    with contextlib.suppress(OSError), RecordingWriter(path, Origin(CONFIG, NUMERICS)) as writer:
         writer.add(heard(turns[0][0]))
         writer.flush()
         raise OSError("full")

@@ -10,14 +10,7 @@ from builders import LIFE, OTHER_LIFE, make_episode
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.replay.numbering import (
-    Counters,
-    accept,
-    filling,
-    progress_of,
-    refill,
-    refusal,
-)
+from services.replay.numbering import Counters, accept, filling, progress_of, refill, refusal
 from shared.config import MemoryConfig
 from shared.errors import StateError
 from shared.rl.turn import Commit

@@ -29,15 +29,7 @@ from shared.config import Config
 from shared.halts.book import new_halt
 from shared.halts.keeper import clock_s
 from shared.keys import OBSERVATION, Stream
-from shared.messages import (
-    Action,
-    Deadline,
-    HaltKind,
-    Message,
-    Motion,
-    Observation,
-    Release,
-)
+from shared.messages import Action, Deadline, HaltKind, Message, Motion, Observation, Release
 from shared.service import StopFlag
 
 LIFE, ACTOR = "a" * 12, "b" * 12

@@ -47,11 +47,7 @@ def test_every_stream_is_allowed_to_those_the_table_names_and_to_nobody_else(
             "put": [("ingress", "put")],
             "hear": [("ingress", "declare_subscriber"), ("egress", "put")],
             "ask": [("ingress", "query"), ("egress", "reply")],
-            "answer": [
-                ("ingress", "declare_queryable"),
-                ("ingress", "reply"),
-                ("egress", "query"),
-            ],
+            "answer": [("ingress", "declare_queryable"), ("ingress", "reply"), ("egress", "query")],
         }.items():
             expected = latest == (action in ("put", "hear")) and may(who, action, stream, ident)
             for flow, message in pairs:

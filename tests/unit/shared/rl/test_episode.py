@@ -630,10 +630,7 @@ def test_lost_actions_are_counted_once_whoever_is_killed_and_interrupted(events:
         if event != "hold":  # a hold: the action given was not executed
             sequence += 1
         observation = observe(
-            sequence,
-            attempt=int(event == "hold"),
-            bump=event == "bump",
-            interruption=interruption,
+            sequence, attempt=int(event == "hold"), bump=event == "bump", interruption=interruption
         )
         if event == "kill actor":
             actor = Actor(CONFIG, "robot1", NEXT_LIFE, FakePredictor())  # type: ignore[arg-type]

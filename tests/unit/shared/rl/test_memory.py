@@ -12,13 +12,7 @@ import pytest
 from builders import FakePredictor, fake_values, fill_store, image_with, make_images
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import (
-    RuleBasedStateMachine,
-    initialize,
-    invariant,
-    precondition,
-    rule,
-)
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from shared.config import MemoryConfig
 from shared.rl import memory as memory_module

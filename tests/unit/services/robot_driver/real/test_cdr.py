@@ -245,9 +245,7 @@ def test_bumpers_of_others_are_read(
         {"header": {"stamp": stamp(ns), "frame_id": frame}, "type": kind} for kind, frame in hazards
     ]
     raw = naive_cdr.encode(
-        {"header": header, "detections": detections},
-        "HazardDetectionVector",
-        little_endian=little,
+        {"header": header, "detections": detections}, "HazardDetectionVector", little_endian=little
     )
     pressed = any(kind in (1, 2, 3) for kind, _ in hazards)
     if any(kind == 4 for kind, _ in hazards):

@@ -82,11 +82,7 @@ def test_the_battery_is_low_or_not_and_its_voltage_is_believed_within_reason() -
 @FAST
 @given(st.binary(max_size=200))
 def test_no_bytes_do_more_than_be_refused(body: bytes) -> None:
-    for parse in (
-        replies.odometry,
-        replies.bumper,
-        replies.battery,
-    ):
+    for parse in (replies.odometry, replies.bumper, replies.battery):
         with suppress(BadMessage):
             parse(body)
 

@@ -15,11 +15,7 @@ from oracles import BITS_OF_PERCENT, Sample
 from shared.config import MemoryConfig
 from shared.rl.memory import SAMPLE, ReplayMemory
 from shared.rl.retention import rmm
-from shared.rl.retention.rmm import (
-    candidates_by_action,
-    force_candidates,
-    scaled_count,
-)
+from shared.rl.retention.rmm import candidates_by_action, force_candidates, scaled_count
 from shared.rl.retention.strategy import Discard, Situation, discard, kept_in_total, kept_of_action
 
 FAST = settings(deadline=None, max_examples=80, derandomize=True)
