@@ -26,8 +26,6 @@ from services.robot_driver.real.ros2_sensors import Ros2Sensors
 from services.robot_driver.robot import STANDSTILL, NotReady, Pose, Velocity
 from shared.foreign_bus import RawSample
 
-SEQUENCES = 12
-"""Of each kind of robot."""
 TICK_S, SOUND_S, LONG_S, WAY_S = 0.02, 1.0, 6.0, 0.01
 PERIODS_S = {"odometry": 0.06, "bumper": 0.06, "camera": 0.1, "battery": 0.5}
 STALE_S = {"odometry": 0.3, "bumper": 0.3, "camera": 0.4}
@@ -254,10 +252,11 @@ def tick(play: Play, robot: HardwareRobot) -> None:
     play.pose = joined(play.pose, step)
 
 
+@pytest.mark.parametrize("sequences", [12, pytest.param(1000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", ["robotino", "bridge", "rmw-zenoh"])
 def test_no_robot_moves_without_the_readings_it_needs(
-    kind: str, clocked: Callable[[str, int], Play]
+    kind: str, sequences: int, clocked: Callable[[str, int], Play]
 ) -> None:
-    told = [clocked(kind, seed).link.told for seed in range(SEQUENCES)]
+    told = [clocked(kind, seed).link.told for seed in range(sequences)]
     moving = [sum(velocity.moving for velocity in one) for one in told]
-    assert sum(moving) > 5 * SEQUENCES, "it is no robot that never moves"
+    assert sum(moving) > 5 * sequences, "it is no robot that never moves"
