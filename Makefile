@@ -16,7 +16,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 # Tests run beside each other: more than one thread each would only get in the way.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
-BESIDE := -n 6 --dist worksteal
+BESIDE := -n 4 --dist worksteal
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test test-full check lint unit system mutants compose-test extras-test bench profile bench-full bench-peers clean
@@ -31,7 +31,7 @@ setup: $(VENV)/.dev ## make the virtual environment with everything in it
 demo: $(VENV)/.all ## install what is needed, then run the demo until Ctrl-C
 	@$(BIN)/corridor up --preset demo $(ARGS)
 
-# Six at a time: most tests that take long wait for something.
+# Four at a time: most tests that take long wait for something.
 test: $(VENV)/.dev ## all checks and tests but the slow ones
 	$(PYTEST) $(BESIDE) -m "not slow" tests
 

@@ -96,7 +96,7 @@ RMW_ZENOH: dict[str, object] = {
     "camera_type": "CompressedImage",
     "bumper_topic": "hazard_detection",
     "bumper_type": "HazardDetectionVector",
-    "bumper_on_change": True,
+    "bumper_on_change": False,
 }
 """A Create 3 whose nodes are on Zenoh themselves."""
 
