@@ -5,27 +5,21 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections import Counter
 from typing import Any
 
 import numpy as np
 
-from services.robot_driver.real.link import Battery, Newest
+from services.robot_driver.real.link import Battery, Slots
 from services.robot_driver.real.odometry import joined
 from services.robot_driver.robot import STANDSTILL, Pose, RobotFault, Velocity
 from shared.config import Config
-from shared.messages import ImageArray
 
 
-class FakeLink:
+class FakeLink(Slots):
     """Readings that stay fresh by themselves until they are held; commands are kept."""
 
     def __init__(self) -> None:
-        self.camera: Newest[ImageArray] = Newest()
-        self.odometry: Newest[Pose] = Newest()
-        self.bumper: Newest[bool] = Newest()
-        self.battery: Newest[Battery] = Newest()
-        self.faults: Counter[str] = Counter()
+        super().__init__()
         self.told: list[Velocity] = []
         self.held: set[str] = set()
         self.pressed = self.low = self.refuses = self.stalled = False

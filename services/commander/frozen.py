@@ -31,7 +31,7 @@ class Frozen:
     episode: int | None = None
     train_steps: int | None = None
     metadata: dict[str, str] = field(default_factory=dict)
-    """Of the file, but for what `episode` and `train_steps` tell."""
+    """What else the file tells of itself, as text."""
 
     def packed(self, metadata: dict[str, str]) -> bytes:
         """A file of weights with these metadata."""

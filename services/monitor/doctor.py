@@ -30,7 +30,7 @@ SHARED = "/dev/shm"  # noqa: S108 - looked at, not written to
 PROBE_S = 60.0
 """Longest that the import of a library may take."""
 PYTHONS = ((3, 11), (3, 14))
-"""From the first to before the second."""
+"""The first Python that does, and the first that does not yet."""
 SHARING = "only with bus.shared_memory"
 LIBRARIES = {
     "eclipse-zenoh": "",

@@ -51,7 +51,7 @@ TABLES = (
     *("dead", "columns", "changes", "turns"),
 )
 LEAST_FREE_BYTES = 1 << 20
-"""With less room on the disk LMDB fails in several ways."""
+"""LMDB fails in several ways where the disk has less room."""
 Txn = Any
 
 
@@ -93,7 +93,7 @@ class Position:
     kept: dict[str, int] = field(default_factory=dict)
     """What strategies of retention keep from one discard to the next."""
     lineage: str = NO_LINEAGE
-    """Of the memory as of `change`."""
+    """The lineage that the memory had at `change`."""
     turn_lineage: str = NO_LINEAGE
     """Of the memory as of `turn_change`."""
 
