@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from services.replay import numbering
-from services.replay.feed import PART_ROWS, Feed
+from services.replay.feed import Feed
 from services.replay.numbering import Counters, Span
 from services.replay.tables import (
     MARKS,
@@ -19,7 +19,6 @@ from services.replay.tables import (
     Tables,
     Txn,
     key_of,
-    match,
     number_of,
     pack,
     unpack,
@@ -27,7 +26,6 @@ from services.replay.tables import (
 from shared.config import MemoryConfig
 from shared.messages import NO_LINEAGE, Episode, Turn
 from shared.rl.memory import ReplayMemory
-from shared.rl.retention.strategy import columns
 from shared.rl.turn import Commit, Maintenance, sample_rows
 
 MAX_WORLDS = 1024
@@ -66,7 +64,8 @@ class Storage:
     def __init__(self, folder: Path, config: MemoryConfig, identity: str) -> None:
         """Open or create. Raises StateError when the files belong to another run or schema."""
         self._config = config
-        self._tables = Tables(folder, config, identity)
+        self._tables = Tables(folder)
+        self._tables.belong_to(config, identity)
         self.feed = Feed(self._tables)
 
     def close(self) -> None:
@@ -229,20 +228,8 @@ class Storage:
 
     def load(self) -> ReplayMemory:
         """The memory as of the newest applied turn."""
-        with self._tables.env.begin() as txn:
-            position = self._tables.position(txn)
-            memory = ReplayMemory(position.capacity)
-            memory.kept = position.kept
-            memory.worlds = list(self._tables.meta(txn, "worlds"))
-            ids = self._tables.alive(txn)
-            for start in range(0, len(ids), PART_ROWS):
-                rows, images = self._tables.rows(txn, ids[start : start + PART_ROWS])
-                memory.append(rows, images)
-            self._tables.overlay_rewards(txn, memory.rows)
-            marks = self._tables.column(txn, "marks", MARKS)
-        known, where = match(memory.ids, marks["id"])
-        for name, *_ in columns():
-            memory.rows[name][known] = marks[name][where]
+        memory = ReplayMemory(1)
+        self._tables.update(memory)
         return memory
 
 

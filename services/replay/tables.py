@@ -19,6 +19,7 @@ leaves one of the two states, and the turn is done again from the first.
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -37,7 +38,7 @@ from shared.config import MemoryConfig
 from shared.errors import ConfigError, DiskFull, StateError
 from shared.facts import IMAGE_SHAPE
 from shared.messages import NO_LINEAGE
-from shared.rl.memory import SAMPLE
+from shared.rl.memory import PART, SAMPLE, ReplayMemory
 from shared.rl.retention.strategy import columns
 from shared.rl.turn import Commit
 
@@ -101,25 +102,40 @@ class Position:
 class Tables:
     """The open files, and what reading and writing within a transaction share."""
 
-    def __init__(self, folder: Path, config: MemoryConfig, identity: str) -> None:
-        """Open or create.
+    def __init__(self, folder: Path, *, readonly: bool = False) -> None:
+        """Open, or create what is not there; readonly: beside the process that writes, if any.
 
-        Raises StateError when the files belong to another run or schema, ConfigError when they
-        cannot be mapped.
+        Raises ConfigError when the files cannot be mapped, StateError when there are none to read.
         """
-        folder.mkdir(parents=True, exist_ok=True)
         self._folder = folder
         try:
+            if not readonly:
+                folder.mkdir(parents=True, exist_ok=True)
             self.env = lmdb.open(
-                str(folder), map_size=MAP_BYTES, max_dbs=len(TABLES), max_readers=64
+                str(folder),
+                map_size=MAP_BYTES,
+                max_dbs=len(TABLES),
+                max_readers=64,
+                readonly=readonly,
+                lock=not readonly or os.access(folder, os.W_OK),
             )
+            self.db = {name: self.env.open_db(name.encode()) for name in TABLES}
         except (MemoryError, lmdb.MemoryError) as error:
             raise ConfigError(
                 f"{folder}: expected {MAP_BYTES >> 30} GB of address space for the replay memory, "
                 "which takes no memory: allow it with `ulimit -v unlimited`"
             ) from error
+        except lmdb.Error as error:
+            if not readonly:
+                raise
+            raise StateError(f"{folder}: expected a replay memory, found none: {error}") from error
         self._mapping = Mapping(folder / "data.mdb")
-        self.db = {name: self.env.open_db(name.encode()) for name in TABLES}
+
+    def belong_to(self, config: MemoryConfig, identity: str) -> None:
+        """Begin a memory of this run in new files.
+
+        Raises StateError when they belong to another run or schema.
+        """
         with self.writing() as txn:
             known = self.meta(txn, "identity")
             if known is None:
@@ -130,8 +146,8 @@ class Tables:
                 self.put_meta(txn, "worlds", [])
             elif list(known) != [SCHEMA, identity]:
                 raise StateError(
-                    f"{folder}: expected a replay memory of schema and run {[SCHEMA, identity]}, "
-                    f"found {list(known)}: choose another run folder"
+                    f"{self._folder}: expected a replay memory of schema and run "
+                    f"{[SCHEMA, identity]}, found {list(known)}: choose another run folder"
                 )
 
     @contextmanager
@@ -196,6 +212,25 @@ class Tables:
         column = self.column(txn, "rewards", REWARDS)
         known, where = match(rows["id"], column["id"])
         rows["reward"][known] = column["reward"][where]
+
+    def update(self, memory: ReplayMemory) -> Position:
+        """Make a memory what it was at the newest applied turn; what it has of that is kept."""
+        with self.env.begin() as txn:
+            position = self.position(txn)
+            memory.set_capacity(position.capacity)
+            memory.kept = position.kept
+            memory.worlds = list(self.meta(txn, "worlds"))
+            alive = np.array(self.alive(txn), np.uint64)
+            memory.remove(memory.ids[~np.isin(memory.ids, alive)])
+            new = [int(i) for i in alive[~np.isin(alive, memory.ids)]]
+            for start in range(0, len(new), PART):
+                memory.append(*self.rows(txn, new[start : start + PART]))
+            self.overlay_rewards(txn, memory.rows)
+            marks = self.column(txn, "marks", MARKS)
+        known, where = match(memory.ids, marks["id"])
+        for name, *_ in columns():
+            memory.rows[name][known] = marks[name][where]
+        return position
 
 
 def match(

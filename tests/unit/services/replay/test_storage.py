@@ -24,12 +24,13 @@ from services.learner.mirror import Mirror, apply
 from services.replay import feed as feed_module
 from services.replay import tables as tables_module
 from services.replay.storage import Storage
+from services.replay.tables import Tables
 from shared.config import MemoryConfig
 from shared.errors import ConfigError, DiskFull, PeerSilent, StateError
 from shared.keys import CHANGES
 from shared.messages import NO_LINEAGE, Change, Episode, FeedEnd
 from shared.rl.draws import generator
-from shared.rl.memory import SampleStore
+from shared.rl.memory import ReplayMemory, SampleStore
 from shared.rl.schedule import Moment
 from shared.rl.turn import maintain
 
@@ -61,6 +62,8 @@ class Bench:
         self.episodes = 0
         self.commits = 0
         self.seen: dict[int, list[tuple[Any, ...]]] = {0: []}
+        self.looked_at = ReplayMemory(1)
+        """What somebody beside the process has, who reads what is new now and then."""
         self.history = [NO_LINEAGE]
         """Lineage after each commit."""
         self.lineages = {0: NO_LINEAGE}
@@ -69,8 +72,12 @@ class Bench:
     def reopen(self) -> None:
         """What a kill -9 and a restart do: memory is read from disk, open turns come again."""
         self.storage.close()
+        looker = Tables(self.folder, readonly=True)
+        looker.update(self.looked_at)
+        looker.env.close()
         self.storage = Storage(self.folder, self.config, IDENTITY)
         self.memory = self.storage.load()
+        equal_memories(self.looked_at, self.memory)
 
     def commit(self, episode: Episode) -> None:
         accepted = self.storage.commit(episode)
@@ -163,16 +170,21 @@ class Bench:
         loaded.check_valid()
         assert loaded.capacity == self.memory.capacity == self.capacity
         assert loaded.kept == self.memory.kept
-        for name in loaded.rows.dtype.names or ():
-            if name != "slot":
-                assert loaded.rows[name].tobytes() == self.memory.rows[name].tobytes(), name
-        every = np.arange(len(loaded))
-        assert loaded.images(every).tobytes() == self.memory.images(every).tobytes()
+        equal_memories(loaded, self.memory)
         for name in ("id", "action", "candidate", "forced"):
             assert loaded.rows[name].tolist() == [s[name] for s in self.model]
         same_samples(loaded, self.seen[self.change])
         for s, reward in zip(self.model, loaded.rows["reward"].tolist(), strict=True):
             s["reward"] = reward
+
+
+def equal_memories(one: ReplayMemory, other: ReplayMemory) -> None:
+    """Both hold the same samples."""
+    for name in one.rows.dtype.names or ():
+        if name != "slot":
+            assert one.rows[name].tobytes() == other.rows[name].tobytes(), name
+    every = np.arange(len(one))
+    assert one.images(every).tobytes() == other.images(every).tobytes()
 
 
 def chained(lineage: str, episode: Episode) -> str:
@@ -471,6 +483,13 @@ def test_files_of_another_schema_are_refused(
     monkeypatch.setattr("services.replay.tables.SCHEMA", 999)
     with pytest.raises(StateError, match="999"):
         Storage(tmp_path, config, IDENTITY)
+
+
+def test_looking_where_no_memory_is_creates_none(tmp_path: Path) -> None:
+    for folder in (tmp_path / "none", tmp_path):
+        with pytest.raises(StateError, match="expected a replay memory, found none"):
+            Tables(folder, readonly=True)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_missing_image_is_told_and_not_made_up() -> None:
