@@ -19,7 +19,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 BESIDE := -n 4 --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-full check lint unit system mutants compose-test extras-test bench profile bench-full bench-peers clean
+.PHONY: help setup demo test test-full check lint unit system mutants compose-test extras-test page-test bench profile bench-full bench-peers clean
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
 
@@ -59,6 +59,9 @@ compose-test: $(VENV)/.made ## images and containers, with kills; needs a Docker
 
 extras-test: $(VENV)/.dev ## every extra from the wheel, in an environment that holds nothing else
 	$(BIN)/python -m tests.extras.trial $(ARGS)
+
+page-test: $(VENV)/.dev ## the web page in a browser: every control, outages, accessibility
+	$(BIN)/python -m tests.page.trial $(ARGS)
 
 bench: $(VENV)/.dev ## measure speed and memory, in minutes; the machine should do nothing else
 	$(BIN)/python -m benchmarks.run_all --short

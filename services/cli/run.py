@@ -15,11 +15,13 @@ from services.cli.options import (
     RunOption,
     SeedOption,
     Sources,
+    TetheredOption,
     Which,
     default_folder,
     grouped,
     import_installed,
 )
+from services.launcher.tether import tether
 
 if TYPE_CHECKING:
     from shared.halts.orders import RobotOrder
@@ -40,7 +42,7 @@ OwnRouterOption = Annotated[
 
 def add_to(app: typer.Typer) -> None:
     """Add the commands."""
-    for command in (up, status, stop):
+    for command in (up, page, status, stop):
         app.command()(grouped(command))
     _add_order(app, "estop", "Stop robots at once; they stay stopped until `corridor clear`.")
     _add_order(app, "clear", "Release the emergency stop of robots.")
@@ -62,6 +64,7 @@ def up(
         int | None,
         typer.Option(help="End by itself after so many episodes (run.episodes); 0: never."),
     ] = None,
+    page: Annotated[bool, typer.Option(help="Show the run on a web page as well.")] = True,
 ) -> None:
     """Start router, replay, learner, actor and driver, and show how the robot learns.
 
@@ -84,8 +87,31 @@ def up(
         listen=listen,
         given=endpoint is not None,
         insecure=insecure,
+        page=page,
     )
     raise typer.Exit(code)
+
+
+def page(
+    which: Which,
+    host: Annotated[str, typer.Option(help="Where to listen, by name.")] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="0: that of before, or any free one.")
+    ] = 0,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Let the page listen beyond loopback.")
+    ] = False,
+    tethered: TetheredOption = False,
+) -> None:
+    """Show a run on a web page and let its robots be commanded there, until stopped.
+
+    With --run-dir a run that is not up is shown as well: its curves and its memory.
+    """
+    if tethered:
+        tether()
+    service = import_installed("services.page.service", "page")
+    place = (which.run_dir, which.endpoint is not None, which.reach)
+    raise typer.Exit(service.run(*place, host, port, insecure=insecure))
 
 
 def status(

@@ -22,6 +22,8 @@ from services.monitor.words import (
     learner_doing,
     replay_doing,
     retention,
+    robot_warnings,
+    service_warnings,
 )
 from shared.messages import ActorState, LearnerState, ReplayState, RobotState
 
@@ -48,6 +50,8 @@ class RunView:
     """What became of the last order given by a key."""
     keys: bool = False
     """Whether keys are read."""
+    page: str = ""
+    """Where the web page of the run is, or why there is none."""
 
 
 # ---------------------------------------------------------------- words
@@ -62,17 +66,9 @@ def episodes(view: RunView) -> str:
 
 def warnings(view: RunView) -> list[str]:
     """What is not as it should be, most urgent first."""
-    return [*_robot_warnings(view), *_child_warnings(view), *_silences(view), *_losses(view)]
-
-
-def _robot_warnings(view: RunView) -> Iterator[str]:
-    for name, seen in view.snapshot.robots.items():
-        if seen.message.state == "estop":
-            yield f"robot {name}: emergency stop, release it by `corridor clear`"
-        elif seen.message.state == "paused":
-            yield f"robot {name}: paused, let it go on by `corridor resume`"
-        if seen.message.reason:
-            yield f"robot {name}: stands still: {seen.message.reason}"
+    seen = view.snapshot
+    services = service_warnings(seen, view.heartbeat_s)
+    return [*robot_warnings(seen), *_child_warnings(view), *services]
 
 
 def _child_warnings(view: RunView) -> Iterator[str]:
@@ -85,21 +81,6 @@ def _child_warnings(view: RunView) -> Iterator[str]:
             times = "once" if child.restarts == 1 else f"{child.restarts} times"
             why = f", last after {child.note}" if child.up_s < RECENT_S else ""
             yield f"{child.name} was restarted {times}{why}"
-
-
-def _silences(view: RunView) -> Iterator[str]:
-    for name, seen in view.snapshot.everybody.items():
-        if seen.age_s > 3 * view.heartbeat_s:
-            yield f"{name}: silent for {seen.age_s:.0f} s"
-
-
-def _losses(view: RunView) -> Iterator[str]:
-    snapshot = view.snapshot
-    undecodable = sum(seen.message.undecodable for seen in snapshot.everybody.values())
-    if undecodable:
-        yield f"{undecodable} messages could not be decoded"
-    if snapshot.replay and snapshot.replay.message.refused:
-        yield f"{snapshot.replay.message.refused} episodes were refused"
 
 
 # ---------------------------------------------------------------- one line
@@ -118,7 +99,7 @@ def _news(view: RunView) -> list[str]:
 
 def _parts(view: RunView) -> list[str]:
     snapshot = view.snapshot
-    parts = [duration(view.uptime_s)]
+    parts = [duration(view.uptime_s), *([f"page {view.page}"] if view.page else [])]
     if snapshot.replay is None and snapshot.learner is None:
         parts.append("services are starting")
     if snapshot.replay is not None:
@@ -165,6 +146,8 @@ def panel(view: RunView, *, small: bool = False) -> RenderableType:
 
 def _rows(view: RunView) -> Iterator[tuple[RenderableType, ...]]:
     snapshot = view.snapshot
+    if view.page:
+        yield "page", Text(view.page, overflow="fold"), ""
     if snapshot.replay is None and snapshot.learner is None:
         yield "starting", ", ".join(child.name for child in view.children), ""
     if snapshot.replay is not None:

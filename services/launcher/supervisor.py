@@ -50,6 +50,8 @@ class ChildSpec:
     """Place in the order of stopping, from 0 to `len(STAGE_ENDS_S) - 1`."""
     may_finish: bool = True
     """Whether exit code 0 means that it is done; otherwise it is restarted."""
+    vital: bool = True
+    """Whether an end that would come again ends everything."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ class Supervisor:
         for child in self._children:
             child.trim()
             code = child.ended()
-            if code in FINAL_CODES:
+            if code in FINAL_CODES and child.spec.vital:
                 return Ending(code, f"{child.spec.name}: {child.last_line() or f'exit {code}'}")
             if code is not None:
                 child.settle(code)

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 from services.launcher.keys import Keys
@@ -34,12 +35,20 @@ log = logging.getLogger(__name__)
 TICK_S = 0.25
 STOP_KEY = " "
 """Emergency stop of all robots."""
+PAGE_NEEDS = ("lmdb", "prometheus_client", "starlette", "uvicorn", "websockets")
+NO_PAGE = "none: pip install 'corridor[page]'"
 PORTS = range(10000, 30000)
 """Kernels give none of these to outgoing connections, so a restarted router finds its port free."""
 
 
 def run_all(
-    config: Config, folder: Path, *, listen: str | None, given: bool, insecure: bool = False
+    config: Config,
+    folder: Path,
+    *,
+    listen: str | None,
+    given: bool,
+    insecure: bool = False,
+    page: bool = True,
 ) -> int:
     """Run everything until Ctrl-C, SIGTERM, the wanted number of episodes or a final error.
 
@@ -65,16 +74,23 @@ def run_all(
         write_atomically(folder / "endpoint", f"{endpoint}\n{credentials}\n".encode())
         setup_logging("up", folder, screen=False)  # the terminal belongs to the display
         specs = child_specs(config, stored, folder, own)
+        page_there = page and all(map(find_spec, PAGE_NEEDS))
+        specs += [_page_spec(folder)] if page_there else []
         environment = {k: v for k, v in os.environ.items() if not k.startswith(settings.ENV_PREFIX)}
         supervisor = Supervisor(specs, folder / "logs", environment, [lock])
-        ending = supervise(config, supervisor, stop)
+        where = folder / "page" if page_there else NO_PAGE if page else ""
+        ending = supervise(config, supervisor, stop, where)
     text = ending.reason if ending.code else f"{ending.reason}; the run lies in {folder}"
     say(f"corridor: {text}", 2 if ending.code else 1)
     return ending.code
 
 
-def supervise(config: Config, supervisor: Supervisor, stop: threading.Event) -> Ending:
+def supervise(
+    config: Config, supervisor: Supervisor, stop: threading.Event, page: Path | str = ""
+) -> Ending:
     """Keep the children running until there is a reason to end; nothing here can block.
+
+    page: the file with the address of the web page, or why there is none.
 
     Views go to the screen's thread. Keys are read, and the emergency stop is given, in another.
     """
@@ -89,6 +105,7 @@ def supervise(config: Config, supervisor: Supervisor, stop: threading.Event) -> 
             now_s = time.monotonic()
             ending = supervisor.poll() or _wanted(config, watcher, stop)
             view = _view(config, now_s - start_s, watcher, supervisor, keys)
+            view = replace(view, page=page if isinstance(page, str) else _address(page))
             if ending is not None:
                 screen.show(replace(view, note="stopping"), last=True)
                 watcher.release()
@@ -144,6 +161,19 @@ def child_specs(
     options = [f"--set={key}={settings.toml_value(value)}" for key, _, value in changes]
     source = ("--config", str(folder / settings.FILE_NAME), "--run-dir", str(folder))
     return [*specs, *(_spec(process, *source, *options) for process in services)]
+
+
+def _page_spec(folder: Path) -> ChildSpec:
+    """The web page. Its end takes nothing down."""
+    command = (*COMMAND, "page", "--run-dir", str(folder), "--tethered")
+    return ChildSpec("page", command, stage=0, may_finish=False, vital=False)
+
+
+def _address(file: Path) -> str:
+    try:
+        return file.read_text().strip()
+    except OSError:
+        return "is starting"
 
 
 def _spec(process: Process, *options: str) -> ChildSpec:

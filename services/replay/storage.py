@@ -165,7 +165,7 @@ class Storage:
             position = self._tables.position(txn)
             number = self._write_changes(txn, position, submission, memory, done)
             if done.discarded.marked:
-                txn.put(b"marks", _column(memory, MARKS), db=self._tables.db["columns"])
+                txn.put(b"marks", _column(memory.rows, MARKS), db=self._tables.db["columns"])
             lineage = summary["lineage"] if number > position.change else position.lineage
             turn, change, turn_lineage = position.turn, position.turn_change, position.turn_lineage
             if commit.episode:
@@ -206,11 +206,14 @@ class Storage:
             number += 1
             ids = removed.astype("<u8").tobytes()
             self.feed.note(txn, number, "discard", ids, next(lineages))
+            if done.discarded.removed is not None:
+                gone = _column(done.discarded.removed, MARKS)
+                txn.put(b"removed", gone, db=self._tables.db["columns"])
             with txn.cursor(self._tables.db["dead"]) as cursor:
                 cursor.putmulti([(key_of(int(i)), key_of(number)) for i in removed])
         if done.equalised:
             number += 1
-            column = _column(memory, REWARDS)
+            column = _column(memory.rows, REWARDS)
             self.feed.note(txn, number, "rewards", column, next(lineages))
             txn.put(b"rewards", column, db=self._tables.db["columns"])
         return number
@@ -240,11 +243,11 @@ def _spans(data: bytes | None) -> list[Span]:
     return list(zip(numbers[::2], numbers[1::2], strict=True))
 
 
-def _column(memory: ReplayMemory, dtype: np.dtype[np.void]) -> bytes:
+def _column(rows: npt.NDArray[np.void], dtype: np.dtype[np.void]) -> bytes:
     """Some fields of all rows as bytes."""
-    column = np.zeros(len(memory), dtype)
+    column = np.zeros(len(rows), dtype)
     for name in dtype.names or ():
-        column[name] = memory.rows[name]
+        column[name] = rows[name]
     return column.tobytes()
 
 

@@ -9,7 +9,8 @@ images    insertion number -> bytes of the image
 samples   insertion number -> row (reward as inserted)
 lives     robot, driver life -> first and last sequence of spans of actions that are settled
 dead      insertion number -> change number of its discard; kept until the feed forgets the change
-columns   "rewards": all rewards after the newest equalisation; "marks": those of retention
+columns   "rewards": all rewards after the newest equalisation; "marks": those of retention;
+          "removed": the marks of what the newest discard removed
 changes   change number -> kind, ids, lineage of the memory before: the feed
 turns     global episode number -> what the learner needs to know
 

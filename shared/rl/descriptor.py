@@ -5,13 +5,16 @@ Two more look at the image alone, and other weights do not change them. All have
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import numpy.typing as npt
-import torch
-from torch import Tensor
 
 from shared.facts import IMAGE_BYTES, IMAGE_HEIGHT, IMAGE_WIDTH
 from shared.rl.draws import generator
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 BLOCKS = 16
 BITS = BLOCKS * (BLOCKS - 1) // 2
@@ -32,6 +35,8 @@ def block_sums(maps: Tensor) -> Tensor:
         return maps.reshape(n, BLOCKS, -1).sum(dim=2)
     if BLOCKS % filters:
         raise ValueError(f"filters must divide {BLOCKS} or be a multiple of it, got {filters}")
+    import torch
+
     stripes = torch.tensor_split(maps, BLOCKS // filters, dim=3)
     return torch.stack([stripe.sum(dim=(2, 3)) for stripe in stripes], dim=2).reshape(n, BLOCKS)
 

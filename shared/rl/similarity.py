@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from torch import Tensor
 
 from shared.rl.descriptor import BITS
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Descriptors = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
@@ -47,6 +48,8 @@ def _signs(descriptors: Descriptors) -> Tensor:
     Products are whole numbers up to 120: exact in bfloat16 too, which is used where the processor
     multiplies it faster.
     """
+    import torch
+
     signs = np.unpackbits(descriptors, axis=1).astype(np.float32) * 2.0 - 1.0
     fast = torch.ops.mkldnn._is_mkldnn_bf16_supported()
     return torch.from_numpy(signs).to(torch.bfloat16 if fast else torch.float32)
@@ -65,7 +68,7 @@ def _any_newer(signs: Tensor, least_product: int) -> Mask:
             if not len(open_rows):
                 break
             padded = np.resize(open_rows, _rounded_up(len(open_rows)))  # over again from the first
-            nearest = _largest_products(signs[torch.from_numpy(padded)], signs[newer])
+            nearest = _largest_products(signs[padded], signs[newer])
             marked[open_rows] = (nearest >= least_product)[: len(open_rows)]
     return marked
 
@@ -80,7 +83,7 @@ def _pieces(start: int, end: int) -> Iterator[slice]:
 
 def _largest_products(rows: Tensor, others: Tensor) -> npt.NDArray[np.int16]:
     """The largest product of each row with any of the others."""
-    return (rows @ others.T).amax(dim=1).to(torch.int16).numpy()
+    return (rows @ others.T).amax(dim=1).short().numpy()
 
 
 def _rounded_up(count: int) -> int:
@@ -103,7 +106,7 @@ def _uncovered(signs: Tensor, least_product: int) -> Mask:
         for row in range(len(block) - 1, -1, -1):
             inside = own[row, row + 1 :] & kept[start + row + 1 : stop]
             kept[start + row] = not (covered[row] or inside.any())
-        fresh = block[torch.from_numpy(kept[start:stop])]
+        fresh = block[kept[start:stop]]
         kept_signs[count : count + len(fresh)] = fresh
         count += len(fresh)
     return ~kept

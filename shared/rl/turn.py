@@ -13,16 +13,16 @@ import numpy as np
 import numpy.typing as npt
 
 from shared.columns import EPISODE
-from shared.rl.engine import Progress
 from shared.rl.equalisation import equalised
 from shared.rl.memory import SAMPLE, Images, ReplayMemory, world_indices
-from shared.rl.predictor import Predictor
 from shared.rl.retention.strategy import Discard, Situation, beyond, discard
 from shared.rl.schedule import Moment, due
 
 if TYPE_CHECKING:
     from shared.config import MemoryConfig
     from shared.messages import Episode
+    from shared.rl.engine import Progress
+    from shared.rl.predictor import Predictor
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ versions, and runs what the extra is for. Prints a line each, and what could not
 from __future__ import annotations
 
 import argparse
+import re
 import shutil
 import signal
 import subprocess
@@ -21,6 +22,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from urllib.request import urlopen
 
 from benchmarks.waiting import wait_until
 from services.launcher.up import free_endpoint
@@ -138,6 +140,21 @@ def _robotino(environment: Environment) -> None:
         server.shutdown()
 
 
+def _page(environment: Environment) -> None:
+    """It is served at the address that it prints."""
+    said = environment.folder / "page.out"
+
+    def served() -> bool:
+        address = re.search(r"http://[\d.:]+/", said.read_text() if said.exists() else "")
+        if address is None:
+            return False
+        with urlopen(f"{address[0]}metrics", timeout=5.0) as answer:  # noqa: S310
+            return b"corridor_page_browsers" in answer.read()
+
+    with environment.running("page", until=served):
+        pass
+
+
 def _ros2(environment: Environment) -> None:
     """Its driver starts in a network without a robot."""
     network = f"robot.ros2.endpoint={environment.endpoint}"
@@ -150,6 +167,7 @@ PURPOSES: dict[str, Callable[[Environment], None]] = {
     "robotino": _robotino,
     "ros2": _ros2,
     "record": _record,
+    "page": _page,
     "actor": _service("actor"),
     "replay": _service("replay"),
     "learner": _service("learner"),

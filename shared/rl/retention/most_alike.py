@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from shared.rl.draws import generator
 from shared.rl.retention.columns import DESCRIBED, Ranks, renew, renew_descriptors
@@ -162,6 +161,8 @@ def sides(
 
 def hamming(packed: Descriptors) -> Distances:
     """Return what counts the bits in which packed rows uint8 [n, bytes] differ."""
+    import torch
+
     bits = 8 * packed.shape[1]
     signs = torch.from_numpy(np.unpackbits(packed, axis=1).astype(np.float32) * 2.0 - 1.0)
 

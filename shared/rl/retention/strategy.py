@@ -54,6 +54,8 @@ class Discard:
     """N from now on: a strategy may let the memory grow (E32)."""
     ids: Ids = field(default_factory=lambda: np.zeros(0, np.uint64))
     """Removed insertion numbers, ascending."""
+    removed: Rows | None = None
+    """Their rows as they were when they went; None without any."""
     marked: bool = False
     """Whether the strategy changed its own columns."""
     keep: Mapping[str, int] = field(default_factory=dict)
@@ -146,6 +148,7 @@ def discard(there: Situation) -> Discard:
     if len(memory) > memory.capacity:
         done = chosen.choose(there)
     if len(done.ids):
+        done = replace(done, removed=memory.rows[memory.ranks(done.ids)])
         memory.remove(done.ids)
     memory.set_capacity(done.capacity)
     memory.kept |= done.keep

@@ -1,0 +1,56 @@
+"""`corridor page`: puts the parts of the page together and serves them until it is stopped."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import typer
+
+from services.page import address
+from services.page.browse import Browser
+from services.page.commands import Desk
+from services.page.folder import Folder
+from services.page.server import Server
+from services.page.watch import Watch
+from shared.config import Config
+from shared.place import RUNS, is_up, those_up
+from shared.service import setup_logging
+
+
+def run(
+    folder: Path | None,
+    given: bool,
+    reach: Callable[[], Config],
+    host: str,
+    port: int,
+    *,
+    insecure: bool,
+) -> int:
+    """Show a run until asked to stop.
+
+    folder: that of the run; None: the run that commands reach. given: the endpoint was chosen on
+    purpose, whether or not a `corridor up` holds the folder.
+
+    Raises:
+        ConfigError: nobody may listen there, or several runs are up and none was chosen.
+    """
+    if folder is None and (up := RUNS / reach().run.name) in those_up():
+        folder = up
+    setup_logging("page", folder)
+    place, found = address.listen(
+        folder / "page" if folder else None, host, port, insecure=insecure
+    )
+    typer.echo(found.url)
+
+    def now() -> Config | None:
+        return reach() if given or not folder or is_up(folder) else None
+
+    memory = Browser(folder)
+    with Watch(now, Folder(folder) if folder else None) as watch:
+        desk = Desk(watch)
+        watch.told = desk.told
+        Server(watch, desk, memory, found).serve(place)
+    memory.end()
+    return os.EX_OK

@@ -1,0 +1,285 @@
+"""The page of a real run with two simulated robots, as a person uses it (see `trial`)."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from statistics import quantiles
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, BrowserContext, Page, expect
+
+from benchmarks.waiting import wait_until
+from shared.bus import Bus, Request
+from shared.config import BusConfig
+from shared.keys import HALT
+from shared.place import used
+from tests.page.rig import Run, at_rest, chromium, context, running
+
+pytestmark = pytest.mark.timeout(420)
+CLICKS, STOP_BAR_MS = 50, 150.0
+expect.set_options(timeout=20_000)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+    with running(tmp_path_factory.mktemp("page") / "run", episodes=8) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as found:
+        yield found
+
+
+class Watched:
+    """A page, all whose requests and complaints are noted."""
+
+    def __init__(self, window: BrowserContext, address: str) -> None:
+        self.requests: list[str] = []
+        self.errors: list[str] = []
+        self.page: Page = window.new_page()
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.on("websocket", lambda socket: self.requests.append(socket.url))
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("console", self._told)
+        self.page.goto(address)
+        expect(self.page.locator("#numbers dd").first).not_to_have_text("–")
+
+    def _told(self, message: object) -> None:
+        kind, text = message.type, message.text  # type: ignore[attr-defined]
+        if (
+            kind in ("error", "warning")
+            and "ERR_CONNECTION" not in text
+            and "WebSocket" not in text
+        ):
+            self.errors.append(text)
+
+    def fine(self, address: str) -> None:
+        """Nothing went elsewhere, and nothing was complained of."""
+        here = address.split("/#")[0]
+        foreign = [url for url in self.requests if not url.replace("ws:", "http:").startswith(here)]
+        assert foreign == []
+        assert self.errors == []
+
+
+@pytest.fixture
+def seen(run: Run, browser: Browser) -> Iterator[Watched]:
+    window = context(browser, 1280)
+    watched = Watched(window, run.address)
+    yield watched
+    watched.fine(run.address)
+    window.close()
+
+
+def robots_are(page: Page, state: str) -> None:
+    for name in ("robotino1", "second"):
+        expect(page.locator(f"#robot-{name} > .hint")).to_contain_text(state)
+
+
+def test_every_panel_has_real_values(seen: Watched, run: Run) -> None:
+    page = seen.page
+    robots_are(page, "in plus")
+    for name in ("robotino1", "second"):
+        expect(page.locator(f"#robot-{name} .chosen")).to_have_count(1)
+        expect(page.locator(f"#robot-{name} > .hint")).to_contain_text("answered after")
+    grey = "c => new Set(c.getContext('2d').getImageData(0, 0, 75, 50).data).size"
+    assert page.locator("#robot-second > canvas").evaluate(grey) > 10
+    for curve in ("fitness", "bumps", "laps", "loss", "threshold", "actions", "worlds"):
+        expect(page.locator(f"#curve-{curve} span")).to_contain_text("—")
+    drawn = "c => c.getContext('2d').getImageData(0, 0, c.width, c.height).data.some(v => v)"
+    assert page.locator("#curve-fitness canvas").evaluate(drawn)
+    assert page.locator("#map").evaluate(drawn)
+    expect(page.locator("#map-text")).to_contain_text("second at")
+    expect(page.locator("#services tr")).to_have_count(6)
+    expect(page.locator("#services")).to_contain_text("0.1.0")
+    expect(page.locator("#doing")).to_contain_text("Memory:")
+    metrics = page.request.get(run.address.split("#")[0] + "metrics").text()
+    assert 'corridor_robot_bumps{robot="second"}' in metrics
+    assert "corridor_learner_train_steps" in metrics
+
+
+def test_stop_clear_pause_and_resume_and_two_pages_agree(
+    seen: Watched, run: Run, browser: Browser
+) -> None:
+    page, other = seen.page, Watched(context(browser, 390, "dark"), run.address).page
+    for press in (
+        lambda: page.get_by_role("button", name="Stop all robots").click(),
+        lambda: page.locator("body").press("Escape"),
+        lambda: page.locator("body").press(" "),
+    ):
+        press()
+        robots_are(page, "estop")
+        for shown in (page, other):
+            expect(shown.locator("#stands")).to_contain_text("2 of 2")
+            expect(shown.locator("#told li").first).to_contain_text("all stand")
+        other.get_by_role("button", name="Clear the stop").click()
+        robots_are(page, "phase" if False else "in plus")
+        expect(page.locator("#stands")).to_be_empty()
+    page.get_by_role("button", name="Pause second").click()
+    expect(other.locator("#robot-second > .hint")).to_contain_text("paused")
+    expect(other.locator("#warnings")).to_contain_text("robot second: paused")
+    other.get_by_role("button", name="Resume second").click()
+    expect(page.locator("#robot-second > .hint")).not_to_contain_text("paused")
+    other.close()
+
+
+def test_worlds_boxes_and_notes(seen: Watched, run: Run) -> None:
+    page = seen.page
+    page.get_by_text("Change the world").click()
+    form = page.locator("#change")
+    form.locator("[name=robot]").select_option("second")
+    for name, value in (("x", "4.88"), ("y", "3.08"), ("side", "0.1")):
+        form.locator(f"[name={name}]").fill(value)
+    page.get_by_role("button", name="Place").click()
+    expect(page.locator("#told li").first).to_contain_text("place box1, second: second: world plus")
+    page.get_by_role("button", name="Remove").click()
+    expect(page.locator("#told li").first).to_contain_text("remove box1")
+    page.locator("#edit").check()
+    size = page.locator("#map").bounding_box()
+    assert size is not None
+    page.locator("#map").click(position={"x": size["width"] / 2, "y": size["height"] / 2})
+    expect(page.locator("#told li").first).to_contain_text("place box1, second")
+    page.locator("#edit").uncheck()
+    form.locator("[name=world]").select_option("minus")
+    page.get_by_role("button", name="Switch").click()
+    expect(page.locator("#robot-second > .hint")).to_contain_text("in minus")
+    expect(page.locator("#map-text")).to_contain_text("World minus")
+    page.locator("#note input").fill("it <b>circles</b>")
+    page.get_by_role("button", name="Keep").click()
+    expect(page.locator("#notes")).to_contain_text("it <b>circles</b>")
+    (note,) = map(json.loads, (run.folder / "notes.jsonl").read_text().splitlines())
+    assert (note["text"], note["episode"] > 0) == ("it <b>circles</b>", True)
+
+
+def look_through_the_memory(page: Page, *, live: bool) -> None:
+    page.get_by_role("button", name="Memory").click()
+    expect(page.locator("#counts")).to_contain_text("of 300 samples")
+    expect(page.locator("#wall button")).to_have_count(48)
+    page.locator("[name=action]").select_option("1")
+    expect(page.locator("#found")).to_contain_text("forward 0, left ")
+    expect(page.locator("#wall button").first).to_contain_text("left")
+    page.get_by_role("button", name="Older").click()
+    expect(page.locator("#found")).to_contain_text("Page 2")
+    page.locator("#wall button").last.click()
+    expect(page.locator("#sample")).to_contain_text("as observed")
+    expect(page.locator("#sample")).to_contain_text("Predicted by the network of episode")
+    expect(page.locator("#sample .bits120 i")).to_have_count(120)
+    expect(page.locator("#sample .wall button").first).to_contain_text("bits")
+    page.locator("#bits").fill("24")
+    page.locator("#bits").dispatch_event("change")
+    expect(page.locator("#found")).to_contain_text("would be marked")
+    expect(page.locator("#gone")).to_contain_text("samples went")
+    expect(page.locator("#pairs .pair").first).to_contain_text("bits")
+
+
+def test_the_memory_of_a_run_that_goes_on(seen: Watched) -> None:
+    page = seen.page
+    page.request.get(page.url.split("#")[0] + "memory/overview")
+    page.get_by_role("button", name="Pause all").click()  # a memory that stands still is compared
+    robots_are(page, "paused")
+    look_through_the_memory(page, live=True)
+    page.get_by_role("button", name="Run", exact=True).click()
+    page.get_by_role("button", name="Resume all").click()
+    robots_are(page, "actor")
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_nothing_serious(width: int, scheme: str, run: Run, browser: Browser) -> None:
+    window = context(browser, width, scheme)
+    page = Watched(window, run.address).page
+    expect(page.locator("#curve-fitness")).to_be_visible()
+    for view in ("Run", "Memory"):
+        page.get_by_role("button", name=view, exact=True).click()
+        if view == "Memory":
+            expect(page.locator("#wall button")).to_have_count(48)
+            page.locator("#wall button").first.click()
+            expect(page.locator("#sample")).to_contain_text("as observed")
+        wide = page.evaluate("document.documentElement.scrollWidth - innerWidth")
+        assert wide <= 0, f"{view} is {wide} pixels too wide"
+        found = Axe().run(page).response["violations"]
+        serious = [v for v in found if v["impact"] in ("serious", "critical")]
+        told = [(v["id"], [n["html"][:120] for n in v["nodes"][:3]]) for v in serious]
+        assert told == [], view
+    window.close()
+
+
+def test_without_the_token_it_shows_and_commands_nothing(run: Run, browser: Browser) -> None:
+    window = context(browser, 1280)
+    page = Watched(window, run.address.split("#")[0]).page
+    page.get_by_role("button", name="Stop all robots").click()
+    expect(page.locator("#alert")).to_contain_text("no valid token")
+    window.close()
+
+
+def test_a_stop_is_heard_soon_after_the_click(seen: Watched, run: Run) -> None:
+    """From the click until zeros leave: a driver that hears a halt stops its robot before all."""
+    page, heard, halts = seen.page, threading.Event(), list[float]()
+
+    def note(request: Request) -> None:
+        with request:
+            halts.append(time.time())
+        heard.set()
+
+    where = used(run.folder)
+    assert where is not None
+    times_ms = []
+    with Bus(BusConfig(endpoint=where[0]), "twins") as bus:
+        bus.serve(HALT, "main", note)
+        page.evaluate("addEventListener('pointerdown', () => { window.at = Date.now(); }, true)")
+        for _ in range(CLICKS):
+            heard.clear()
+            halts.clear()
+            page.locator("#stop").click()
+            assert heard.wait(20.0)
+            times_ms.append(1e3 * halts[0] - page.evaluate("window.at"))
+        expect(page.locator("#stands")).to_contain_text("2 of 2")
+        page.get_by_role("button", name="Clear the stop").click()
+        robots_are(page, "actor")
+    p95 = quantiles(times_ms, n=20)[-1]
+    print(
+        f"\nstop: {CLICKS} clicks, p95 {p95:.0f} ms until the halt is heard, "
+        f"{max(times_ms):.0f} ms at most"
+    )
+    assert p95 <= STOP_BAR_MS
+
+
+@pytest.mark.parametrize("killed", ["page", "router"])
+def test_it_says_what_is_gone_and_comes_back(killed: str, seen: Watched, run: Run) -> None:
+    page, before = seen.page, run.pid(killed)
+    run.kill(killed)
+    alert = page.locator("#alert")
+    expect(alert).to_contain_text(
+        "page process" if killed == "page" else "No router", timeout=15_000
+    )
+    expect(page.locator("body")).to_have_class("lost")
+    wait_until(lambda: run.pid(killed) != before, 30.0, f"another {killed}")
+    expect(alert).to_be_hidden(timeout=60_000)
+    robots_are(page, "actor")
+    shown = page.locator("#numbers dd").nth(4)
+    before_text = shown.inner_text()
+    wait_until(partial(lambda: shown.inner_text() != before_text), 60.0, "more actions")
+
+
+def test_a_run_that_is_over_is_shown_from_its_folder(
+    run: Run, browser: Browser, tmp_path: Path
+) -> None:
+    """Last: it ends the run."""
+    import shutil
+
+    copy = tmp_path / "over"
+    shutil.copytree(run.folder, copy, ignore=shutil.ignore_patterns("lock", "endpoint", "page"))
+    with at_rest(copy) as address:
+        window = context(browser, 1280)
+        page = window.new_page()
+        page.goto(address)
+        expect(page.locator("#curve-fitness")).to_be_visible()
+        look_through_the_memory(page, live=False)
+        window.close()
