@@ -17,6 +17,7 @@ from services.page.watch import Watch
 from shared.config import Config
 from shared.place import RUNS, is_up, those_up
 from shared.service import setup_logging
+from shared.threads import stop_on_signals
 
 
 def run(
@@ -48,7 +49,8 @@ def run(
         return reach() if given or not folder or is_up(folder) else None
 
     memory = Browser(folder)
-    with Watch(now, Folder(folder) if folder else None) as watch:
+    # uvicorn repeats a signal when it is done: it ends nothing then.
+    with stop_on_signals(), Watch(now, Folder(folder) if folder else None) as watch:
         desk = Desk(watch)
         watch.told = desk.told
         Server(watch, desk, memory, found).serve(place)

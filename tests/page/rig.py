@@ -45,9 +45,11 @@ class Run:
         return (self.folder / "page").read_text().strip()
 
     def pid(self, name: str) -> int:
-        """The newest process of one child."""
-        rows = (self.folder / "logs" / "up.log").read_text().splitlines()
-        return [int(r.rsplit(" ", 1)[1]) for r in rows if f" {name} started as process " in r][-1]
+        """The newest process of one child; 0 before there is one."""
+        log = self.folder / "logs" / "up.log"
+        rows = log.read_text().splitlines() if log.exists() else []
+        started = f" {name} started as process "
+        return [0, *(int(row.rsplit(" ", 1)[1]) for row in rows if started in row)][-1]
 
     def kill(self, name: str) -> None:
         """As by `kill -9`."""

@@ -135,7 +135,7 @@ def test_worlds_boxes_and_notes(seen: Watched, run: Run) -> None:
     page.get_by_text("Change the world").click()
     form = page.locator("#change")
     form.locator("[name=robot]").select_option("second")
-    for name, value in (("x", "4.88"), ("y", "3.08"), ("side", "0.1")):
+    for name, value in (("x", "4.84"), ("y", "3.04"), ("side", "0.1")):
         form.locator(f"[name={name}]").fill(value)
     page.get_by_role("button", name="Place").click()
     expect(page.locator("#told li").first).to_contain_text("place box1, second: second: world plus")

@@ -14,6 +14,15 @@ export function el(tag, attributes = {}, ...children) {
   return made;
 }
 
+export function bars(title, counts) { // {name: [count, words]} as bars of one length to another
+  const most = Math.max(1, ...Object.values(counts).map(([count]) => count));
+  return el("div", {}, el("h3", {}, title), el("div", { class: "bars" }, ...Object.entries(counts).flatMap(([name, [count, words]]) => {
+    const bar = el("i");
+    bar.style.width = `${(100 * count) / most}%`;
+    return [el("span", {}, name), el("div", { class: "bar" }, bar), el("span", {}, words ?? count)];
+  })));
+}
+
 export function text(element, value) { // untouched if it is the same: nothing is read out again
   if (element.textContent !== value) element.textContent = value;
 }
@@ -57,7 +66,7 @@ export function curve(canvas, data, marks = []) {
   const [context, width, height] = sized(canvas), names = Object.keys(data.y), [left, bottom] = [36, 16];
   const all = names.flatMap((name) => data.y[name]).filter((v) => v != null);
   if (!all.length) return;
-  const low = Math.min(0, ...all), high = Math.max(...all, low + 1e-9), [first, last] = [data.x[0], data.x.at(-1)];
+  const low = Math.min(0, ...all), top = Math.max(...all), high = top > low ? top : low + 1, [first, last] = [data.x[0], data.x.at(-1)];
   const X = (x) => left + ((x - first) / Math.max(1, last - first)) * (width - left - 4);
   const Y = (y) => 6 + (1 - (y - low) / (high - low)) * (height - bottom - 8);
   context.fillStyle = colour("dim");

@@ -1,5 +1,5 @@
 // The memory: a wall of its images, one sample in detail, what went last, what a threshold would mark.
-import { $, ACTIONS, el, picture, short } from "./draw.js";
+import { $, ACTIONS, bars, el, picture, short } from "./draw.js";
 
 const PAGE = 48, filter = { action: "", world: "", candidate: "", least: "", most: "", youngest: "", oldest: "", bits: "" };
 let page = 0, asked = 0;
@@ -39,7 +39,7 @@ function layout() {
       "The robot keeps each image that it acted on, with the action and the reward that followed. When the memory is full, "
       + "some samples must go. Replay memory management lets those go that look like newer samples of the same action, "
       + "and never more of an action than it has above its third. So rare views stay, and the memory forgets no corridor."),
-      el("p", { id: "counts" }), el("button", { type: "button", onclick: openMemory }, "Look again")),
+      el("p", { id: "counts" }), el("div", { id: "parts", class: "counts" }), el("button", { type: "button", onclick: openMemory }, "Look again")),
     section("wall", "Images",
       el("div", { id: "filters" }, el("form", {},
         field("action", "Action", [["", "all"], ...ACTIONS.map((name, n) => [n, name])]),
@@ -64,12 +64,13 @@ function bitsText(bits) {
 }
 
 function overview(told) {
-  const actions = ACTIONS.map((name, n) => `${name} ${told.by_action[n]} (candidates ${told.candidates[n]})`).join(", ");
-  const worlds = Object.entries(told.worlds).map(([name, count]) => `${name} ${count}`).join(", ");
-  const [edges, counts] = told.ages, ages = counts.map((count, n) => `${edges[n]} to ${edges[n + 1]}: ${count}`).join(", ");
-  $("counts").textContent = `${told.size} of ${told.capacity} samples at episode ${told.turn}. By action: ${actions}. By world: ${worlds}. `
-    + `By age in episodes: ${ages}; from the filling ${told.fill}. Strategy ${told.strategy}, threshold ${told.threshold_percent} %; `
-    + `${told.described} samples have a descriptor.`;
+  const [edges, counts] = told.ages;
+  $("counts").textContent = `${told.size} of ${told.capacity} samples at episode ${told.turn}. Strategy ${told.strategy}, `
+    + `threshold ${told.threshold_percent} %. ${told.described} samples have a descriptor.`;
+  $("parts").replaceChildren(
+    bars("By action", Object.fromEntries(ACTIONS.map((name, n) => [name, [told.by_action[n], `${told.by_action[n]}, candidates ${told.candidates[n]}`]]))),
+    bars("By world", Object.fromEntries(Object.entries(told.worlds).map(([name, count]) => [name, [count]]))),
+    bars("By age in episodes", { ...Object.fromEntries(counts.map((count, n) => [`${edges[n]} to ${edges[n + 1]}`, [count]])), "from the filling": [told.fill] }));
   const worldsOf = $("filters").querySelector("[name=world]");
   if (worldsOf.options.length !== Object.keys(told.worlds).length + 1)
     worldsOf.replaceChildren(el("option", { value: "" }, "all"), ...Object.keys(told.worlds).map((name) => el("option", { value: name }, name)));
@@ -116,12 +117,11 @@ async function detail(id) {
     (error) => { guess.textContent = `No prediction: ${error.message}.`; });
 }
 
-const WHY = { alike: "looked like the newer one beside it", decree: "marked by decree", age: "oldest: candidates ran out, or the strategy goes by age" };
-
 async function discard() {
   const { count, reasons, samples } = await ask("discard");
   $("gone").textContent = count ? `${count} samples went: ${reasons.alike} because they looked like newer ones, ${reasons.decree} by decree, `
-    + `${reasons.age} by age. Left is what went, right the newer sample that it is most like.` : "Nothing has been discarded yet.";
-  $("pairs").replaceChildren(...samples.map((s) => el("div", { class: "pair" }, tile(s, "went"),
-    s.like ? tile(s.like, `${s.like.bits} bits`) : el("span"), el("p", {}, `${ACTIONS[s.action]}: ${WHY[s.why]}`))));
+    + `${reasons.age} by age, because candidates ran out or the strategy goes by age. Left is what went, right the newer sample of `
+    + "its action that it is most like." : "Nothing has been discarded yet.";
+  $("pairs").replaceChildren(...samples.map((s) => el("div", { class: "pair" }, tile(s, `went, ${s.why}`),
+    s.like ? tile(s.like, `${s.like.bits} bits from it`) : el("span"))));
 }
