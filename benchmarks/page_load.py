@@ -126,7 +126,7 @@ def training(endpoint: str, seconds: float) -> float:
 
 def look(folder: Path, seconds: float, *, page: bool) -> Found:
     """One run of the demo, with a page that a browser looks at, or without."""
-    with running(folder, "--page" if page else "--no-page") as endpoint:
+    with running(folder, *([] if page else ["--no-page"])) as endpoint:
         if not page:
             return Found(training(endpoint, seconds))
         address = wait_until(

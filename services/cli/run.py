@@ -64,7 +64,7 @@ def up(
         int | None,
         typer.Option(help="End by itself after so many episodes (run.episodes); 0: never."),
     ] = None,
-    page: Annotated[bool, typer.Option(help="Show the run on a web page as well.")] = True,
+    no_page: Annotated[bool, typer.Option("--no-page", help="Do without a web page.")] = False,
 ) -> None:
     """Start router, replay, learner, actor and driver, and show how the robot learns.
 
@@ -87,7 +87,7 @@ def up(
         listen=listen,
         given=endpoint is not None,
         insecure=insecure,
-        page=page,
+        page=not no_page,
     )
     raise typer.Exit(code)
 

@@ -22,8 +22,6 @@ from services.monitor.words import (
     learner_doing,
     replay_doing,
     retention,
-    robot_warnings,
-    service_warnings,
 )
 from shared.messages import ActorState, LearnerState, ReplayState, RobotState
 
@@ -44,14 +42,14 @@ class RunView:
     episodes_wanted: int = 0
     """0: no end in sight."""
     heartbeat_s: float = 1.0
+    page: str = ""
+    """Where the web page of the run is, or why there is none."""
     note: str = ""
     """What the whole run does, such as "stopping"; empty while it drives."""
     told: str = ""
     """What became of the last order given by a key."""
     keys: bool = False
     """Whether keys are read."""
-    page: str = ""
-    """Where the web page of the run is, or why there is none."""
 
 
 # ---------------------------------------------------------------- words
@@ -66,9 +64,17 @@ def episodes(view: RunView) -> str:
 
 def warnings(view: RunView) -> list[str]:
     """What is not as it should be, most urgent first."""
-    seen = view.snapshot
-    services = service_warnings(seen, view.heartbeat_s)
-    return [*robot_warnings(seen), *_child_warnings(view), *services]
+    return [*_robot_warnings(view), *_child_warnings(view), *_silences(view), *_losses(view)]
+
+
+def _robot_warnings(view: RunView) -> Iterator[str]:
+    for name, seen in view.snapshot.robots.items():
+        if seen.message.state == "estop":
+            yield f"robot {name}: emergency stop, release it by `corridor clear`"
+        elif seen.message.state == "paused":
+            yield f"robot {name}: paused, let it go on by `corridor resume`"
+        if seen.message.reason:
+            yield f"robot {name}: stands still: {seen.message.reason}"
 
 
 def _child_warnings(view: RunView) -> Iterator[str]:
@@ -81,6 +87,21 @@ def _child_warnings(view: RunView) -> Iterator[str]:
             times = "once" if child.restarts == 1 else f"{child.restarts} times"
             why = f", last after {child.note}" if child.up_s < RECENT_S else ""
             yield f"{child.name} was restarted {times}{why}"
+
+
+def _silences(view: RunView) -> Iterator[str]:
+    for name, seen in view.snapshot.everybody.items():
+        if seen.age_s > 3 * view.heartbeat_s:
+            yield f"{name}: silent for {seen.age_s:.0f} s"
+
+
+def _losses(view: RunView) -> Iterator[str]:
+    snapshot = view.snapshot
+    undecodable = sum(seen.message.undecodable for seen in snapshot.everybody.values())
+    if undecodable:
+        yield f"{undecodable} messages could not be decoded"
+    if snapshot.replay and snapshot.replay.message.refused:
+        yield f"{snapshot.replay.message.refused} episodes were refused"
 
 
 # ---------------------------------------------------------------- one line

@@ -8,7 +8,7 @@ import random
 import socket
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -74,11 +74,9 @@ def run_all(
         write_atomically(folder / "endpoint", f"{endpoint}\n{credentials}\n".encode())
         setup_logging("up", folder, screen=False)  # the terminal belongs to the display
         specs = child_specs(config, stored, folder, own)
-        page_there = page and all(map(find_spec, PAGE_NEEDS))
-        specs += [_page_spec(folder)] if page_there else []
+        where = add_page(specs, folder) if page else str
         environment = {k: v for k, v in os.environ.items() if not k.startswith(settings.ENV_PREFIX)}
         supervisor = Supervisor(specs, folder / "logs", environment, [lock])
-        where = folder / "page" if page_there else NO_PAGE if page else ""
         ending = supervise(config, supervisor, stop, where)
     text = ending.reason if ending.code else f"{ending.reason}; the run lies in {folder}"
     say(f"corridor: {text}", 2 if ending.code else 1)
@@ -86,13 +84,12 @@ def run_all(
 
 
 def supervise(
-    config: Config, supervisor: Supervisor, stop: threading.Event, page: Path | str = ""
+    config: Config, supervisor: Supervisor, stop: threading.Event, page: Callable[[], str] = str
 ) -> Ending:
     """Keep the children running until there is a reason to end; nothing here can block.
 
-    page: the file with the address of the web page, or why there is none.
-
-    Views go to the screen's thread. Keys are read, and the emergency stop is given, in another.
+    page: tells where the web page is. Views go to the screen's thread. Keys are read, and the
+    emergency stop is given, in another.
     """
     start_s, watchdog = time.monotonic(), Watchdog(config)
     with (
@@ -105,7 +102,7 @@ def supervise(
             now_s = time.monotonic()
             ending = supervisor.poll() or _wanted(config, watcher, stop)
             view = _view(config, now_s - start_s, watcher, supervisor, keys)
-            view = replace(view, page=page if isinstance(page, str) else _address(page))
+            view = replace(view, page=page())
             if ending is not None:
                 screen.show(replace(view, note="stopping"), last=True)
                 watcher.release()
@@ -163,17 +160,14 @@ def child_specs(
     return [*specs, *(_spec(process, *source, *options) for process in services)]
 
 
-def _page_spec(folder: Path) -> ChildSpec:
-    """The web page. Its end takes nothing down."""
+def add_page(specs: list[ChildSpec], folder: Path) -> Callable[[], str]:
+    """Add the web page, if its libraries are there; its end ends nothing. Returns where it is."""
+    if not all(map(find_spec, PAGE_NEEDS)):
+        return lambda: NO_PAGE
     command = (*COMMAND, "page", "--run-dir", str(folder), "--tethered")
-    return ChildSpec("page", command, stage=0, may_finish=False, vital=False)
-
-
-def _address(file: Path) -> str:
-    try:
-        return file.read_text().strip()
-    except OSError:
-        return "is starting"
+    specs.append(ChildSpec("page", command, stage=0, may_finish=False, vital=False))
+    file = folder / "page"
+    return lambda: file.read_text().strip() if file.exists() else "is starting"
 
 
 def _spec(process: Process, *options: str) -> ChildSpec:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
-from services.monitor.heartbeats import Snapshot
 from shared.facts import SHORT_NAMES
 from shared.messages import LearnerState, ReplayState
 
@@ -55,25 +54,3 @@ def retention(replay: ReplayState) -> str:
     """What the strategy of retention tells of itself; a dash while that is nothing."""
     told = (f"{each.name.replace('_', ' ')} {each.value}" for each in replay.retention)
     return "  ".join(told) or "-"
-
-
-def robot_warnings(seen: Snapshot) -> Iterator[str]:
-    """Why robots stand that should drive."""
-    for name, robot in seen.robots.items():
-        if robot.message.state == "estop":
-            yield f"robot {name}: emergency stop, release it by `corridor clear`"
-        elif robot.message.state == "paused":
-            yield f"robot {name}: paused, let it go on by `corridor resume`"
-        if robot.message.reason:
-            yield f"robot {name}: stands still: {robot.message.reason}"
-
-
-def service_warnings(seen: Snapshot, heartbeat_s: float) -> Iterator[str]:
-    """Who is silent, and what was lost on the way."""
-    for name, entry in seen.everybody.items():
-        if entry.age_s > 3 * heartbeat_s:
-            yield f"{name}: silent for {entry.age_s:.0f} s"
-    if undecodable := sum(entry.message.undecodable for entry in seen.everybody.values()):
-        yield f"{undecodable} messages could not be decoded"
-    if seen.replay and seen.replay.message.refused:
-        yield f"{seen.replay.message.refused} episodes were refused"

@@ -1,4 +1,4 @@
-"""What the folder of a run tells: curves, obstacles, notes, and the maps of its worlds."""
+"""What the folder of a run tells: curves, findings, obstacles, notes, and maps of its worlds."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import csv
 import io
 import json
 import threading
+from collections.abc import Sequence
 from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +17,19 @@ import msgpack
 import numpy as np
 import numpy.typing as npt
 
+from services.monitor.heartbeats import Snapshot
 from services.robot_driver.simulated.world import WorldError, load_world
 from services.robot_driver.simulated.world_parts import Obstacle
+from shared import settings
 from shared.facts import SHORT_NAMES
 from shared.run_record import EPISODES, TRAINING, now_utc, samples_by_world
 
-POINTS = 240
-"""Points of a curve: as many as a narrow picture shows."""
+POINTS, JUDGED = 240, 1000
+"""Points of a curve, and newest episodes by which a run is judged."""
 NOTES, MOST_BYTES, NOTES_SHOWN = "notes.jsonl", 1 << 20, 30
 """File of the notes, its largest size, and how many of them are shown."""
 Row = dict[str, str]
+Floats = npt.NDArray[np.float64]
 
 
 class Tail:
@@ -44,14 +50,13 @@ class Tail:
                 self._file, self._offset, self._head, self.rows = found.st_ino, 0, "", []
             stream.seek(self._offset)
             data = stream.read().rpartition(b"\n")[0]
-        if not data:
-            return False
-        self._offset += len(data) + 1
-        text = data.decode(errors="replace")
-        if not self._head:
-            self._head, _, text = text.partition("\n")
-        self.rows += csv.DictReader(io.StringIO(f"{self._head}\n{text}"))
-        return True
+        if data:
+            self._offset += len(data) + 1
+            text = data.decode(errors="replace")
+            if not self._head:
+                self._head, _, text = text.partition("\n")
+            self.rows += csv.DictReader(io.StringIO(f"{self._head}\n{text}"))
+        return bool(data)
 
 
 class Folder:
@@ -64,27 +69,40 @@ class Folder:
 
     def curves(self) -> dict[str, Any] | None:
         """All curves; None if they are as they were."""
-        if not self._episodes.update() | self._training.update():
+        if not self._episodes.update() | self._training.update() or not self._episodes.rows:
             return None
         rows, trained = self._episodes.rows, self._training.rows
+        at = _spread(len(rows))
+        few, lately = [rows[i] for i in at], [trained[i] for i in _spread(len(trained))]
         bumps, actions, fitness = (_column(rows, n) for n in ("bump", "actions", "fitness"))
-        worlds = samples_by_world(rows[-1].get("by_world") or "") if rows else {}
-        return {
-            "fitness": thinned(rows, mean=moving(fitness, np.ones(len(rows)), 100)),
-            "bumps": thinned(rows, bumps=1000 * moving(bumps, actions, 1000)),
-            "laps": thinned(rows, left="laps_left", right="laps_right"),
-            "loss": thinned(trained, loss="loss"),
-            "threshold": thinned(rows, percent="threshold_percent"),
-            "actions": thinned(rows, **{name: name for name in SHORT_NAMES}),
-            "worlds": thinned(rows, **{name: _of_world(rows, name) for name in worlds}),
-            "discarded": thinned(rows, discarded="discarded", by_age="last_resort"),
+        worlds = [samples_by_world(row.get("by_world") or "") for row in few]
+        told: dict[str, dict[str, Sequence[float] | Floats]] = {
+            "fitness": {"mean": moving(fitness, np.ones(len(rows)), 100)[at]},
+            "bumps": {"bumps": 1000 * moving(bumps, actions, 1000)[at]},
+            "laps": {name: _column(few, f"laps_{name}") for name in ("left", "right")},
+            "threshold": {"percent": _column(few, "threshold_percent")},
+            "actions": {name: _column(few, name) for name in SHORT_NAMES},
+            "worlds": {world: [counts.get(world, 0) for counts in worlds] for world in worlds[-1]},
+            "discarded": {n: _column(few, n) for n in ("discarded", "last_resort")},
         }
+        shown = {name: _curve(few, series) for name, series in told.items()}
+        return {**shown, "loss": _curve(lately, {"loss": _column(lately, "loss")})}
+
+    def findings(self, seen: Snapshot | None) -> list[str]:
+        """Why the run does not learn. seen: its heartbeats, once all had the time to come."""
+        if not find_spec("services.monitor.diagnose"):
+            return []
+        diagnose = import_module("services.monitor.diagnose")
+        trained = {row["episode"]: row for row in self._training.rows[-JUDGED:]}
+        rows = [row | trained.get(row["episode"], {}) for row in self._episodes.rows[-JUDGED:]]
+        evidence = diagnose.Evidence(settings.read_folder(self.path), rows, live=seen)
+        found = diagnose.findings(evidence)
+        return [f"{f.illness}: {f.measured}; usual: {f.usual}. {f.remedy}" for f in found]
 
     def obstacles(self, robot: str, world: str) -> list[dict[str, Any]]:
         """The obstacles around a robot: those its driver wrote down, else those of the world."""
         try:
-            path = self.path / "robot" / robot / "world.msgpack"
-            kept = msgpack.unpackb(path.read_bytes())
+            kept = msgpack.unpackb((self.path / "robot" / robot / "world.msgpack").read_bytes())
             if kept["world"] == world:
                 return [_drawn(Obstacle.model_validate(tree)) for tree in kept["obstacles"]]
         except (OSError, ValueError, KeyError, TypeError):
@@ -107,34 +125,31 @@ class Folder:
         return [json.loads(line) for line in lines]
 
 
-def _column(rows: list[Row], name: str) -> npt.NDArray[np.float64]:
+def _spread(count: int) -> list[int]:
+    """At most `POINTS` places of so many, first and last among them."""
+    places = np.linspace(0, max(count - 1, 0), min(count, POINTS)).astype(int)
+    return [int(place) for place in np.unique(places)]
+
+
+def _column(rows: list[Row], name: str) -> Floats:
     return np.array([float(row.get(name) or "nan") for row in rows])
 
 
-def _of_world(rows: list[Row], world: str) -> npt.NDArray[np.float64]:
-    counts = (samples_by_world(row.get("by_world") or "").get(world, 0) for row in rows)
-    return np.array([float(count) for count in counts])
-
-
-def moving(
-    values: npt.NDArray[np.float64], weights: npt.NDArray[np.float64], window: float
-) -> npt.NDArray[np.float64]:
+def moving(values: Floats, weights: Floats, window: float) -> Floats:
     """Sum of values over that of weights, in as many rows up to each as weigh `window`."""
     total, weight = (np.concatenate([[0.0], np.cumsum(v)]) for v in (values, weights))
     first = np.searchsorted(weight, weight[1:] - window)
     return np.asarray((total[1:] - total[first]) / np.maximum(weight[1:] - weight[first], 1.0))
 
 
-def thinned(rows: list[Row], **series: str | npt.NDArray[np.float64]) -> dict[str, Any]:
-    """Some rows, the newest among them: their episodes, and the values of each series."""
-    chosen = np.unique(np.linspace(0, max(len(rows) - 1, 0), min(len(rows), POINTS)).astype(int))
+def _curve(rows: list[Row], series: dict[str, Sequence[float] | Floats]) -> dict[str, Any]:
+    """Episodes and values, ready for JSON."""
 
-    def shown(values: str | npt.NDArray[np.float64]) -> list[float | None]:
-        found = (_column(rows, values) if isinstance(values, str) else values)[chosen]
-        return [None if np.isnan(value) else float(f"{value:.4g}") for value in found]
+    def shown(values: Sequence[float] | Floats) -> list[float | None]:
+        return [None if np.isnan(value) else float(f"{value:.4g}") for value in values]
 
-    x = [int(rows[i]["episode"]) for i in chosen]
-    return {"x": x, "y": {name: shown(values) for name, values in series.items()}}
+    y = {name: shown(values) for name, values in series.items()}
+    return {"x": [int(row["episode"]) for row in rows], "y": y}
 
 
 @cache

@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any, Self
 
+from services.launcher.live import RunView, warnings
 from services.monitor import words
 from services.monitor.heartbeats import Reader, Snapshot
 from services.page.folder import Folder, map_of
@@ -23,7 +24,7 @@ from services.robot_driver.simulated.world import world_files
 from shared.bus import Bus
 from shared.codec import decode
 from shared.config import Config
-from shared.errors import BadMessage, CorridorError
+from shared.errors import BadMessage, RouterMissing
 from shared.inbox import MAX_SENDERS, Inbox
 from shared.keys import ACTION, OBSERVATION, PING
 from shared.messages import Action, Observation, Ping, ServiceReply
@@ -31,8 +32,9 @@ from shared.messages import Action, Observation, Ping, ServiceReply
 log = logging.getLogger(__name__)
 PERIOD_S, IDLE_PERIOD_S = 0.2, 1.0
 """How often the page looks, with and without a browser."""
-SLOW_S, AWAY_S = 2.0, 3.0
-"""How often the folder is read and services are asked; how long a router may be away."""
+READ_S, JUDGED_S, AWAY_S = 2.0, 10.0, 3.0
+"""How often the folder is read and services are asked, how often the run is judged; how long a
+router may be away."""
 KEPT = 256
 """Messages of one sender between two looks."""
 
@@ -81,19 +83,11 @@ class Stamped:
 class Watch:
     """Looks at a run again and again. Use as a context manager.
 
-    Args:
-        reach: how the run is reached now; None while it is not up.
-        folder: that of the run, if it is on this machine.
-        findings: why it does not learn, from what was seen and the folder.
+    reach: how the run is reached now; None while it is not up. folder: None on another machine.
     """
 
-    def __init__(
-        self,
-        reach: Callable[[], Config | None],
-        folder: Folder | None,
-        findings: Callable[[Snapshot], list[str]] = lambda _: [],
-    ) -> None:
-        self._reach, self.folder, self._findings = reach, folder, findings
+    def __init__(self, reach: Callable[[], Config | None], folder: Folder | None) -> None:
+        self._reach, self.folder = reach, folder
         self.sections: Mapping[str, str] = {"worlds": json.dumps([*world_files()])}
         """The newest of each section as JSON; replaced as a whole."""
         self.snapshot, self.tracks, self.lost = Snapshot(), dict[str, Track](), 0
@@ -104,7 +98,8 @@ class Watch:
         self.told: Callable[[], object] = list
         """What became of the newest orders."""
         self._replies: dict[str, ServiceReply] = {}
-        self._done, self._slow_s = threading.Event(), 0.0
+        self._done = threading.Event()
+        self._read_s = self._judged_s = 0.0
         self._thread = threading.Thread(target=self._watch, name="watch", daemon=True)
 
     def __enter__(self) -> Self:
@@ -117,24 +112,30 @@ class Watch:
 
     def _watch(self) -> None:
         while not self._done.is_set():
-            config = None
             try:
-                if config := self._reach():
-                    with Bus(config.bus, config.run.name) as self.bus:
-                        self._listen(self.bus, config)
-            except CorridorError as error:
-                log.debug("%s", error)
+                self._look()
             except Exception:  # it must look again, whatever it is
                 log.exception("the page begins to watch anew")
-            finally:
-                self.bus = None
-            self._tell(config, connected=False)
             self._done.wait(IDLE_PERIOD_S)
+
+    def _look(self) -> None:
+        """Watch as long as a router answers; tell the folder alone without one."""
+        config = self._reach()
+        try:
+            if config:
+                with Bus(config.bus, config.run.name) as self.bus:
+                    self._listen(self.bus, config)
+        except RouterMissing as error:
+            log.debug("%s", error)
+        finally:
+            self.bus = None
+        self._tell(config, 0.0)
 
     def _listen(self, bus: Bus, config: Config) -> None:
         """Watch until the page ends, or the router is away for so long that it may be elsewhere."""
         inbox, stamped = bus.inbox(), Stamped(bus)
-        reader, heard_s = Reader(inbox), time.monotonic()
+        reader, begun_s = Reader(inbox), time.monotonic()
+        heard_s = begun_s
         while not self._done.wait(PERIOD_S if self.browsers else IDLE_PERIOD_S):
             now_s = time.monotonic()
             heard_s = now_s if bus.connected else heard_s
@@ -143,35 +144,38 @@ class Watch:
             reader.update()
             stamped.into(self.tracks)
             self.snapshot, self.lost = reader.snapshot(), stamped.lost
-            if now_s - self._slow_s >= SLOW_S:
+            if now_s - self._read_s >= READ_S:
                 self._ask(bus, inbox)
-            self._tell(config, connected=heard_s == now_s)
+            self._tell(config, now_s - begun_s if heard_s == now_s else 0.0)
 
     def _ask(self, bus: Bus, inbox: Inbox) -> None:
         """Ask every service who it is; take the answers to the last time."""
         self._replies = {reply.life: reply for reply in inbox.answers(ServiceReply)}
         for peer in bus.peers():
             with suppress(ValueError):  # an id from outside may be too long for a key
-                inbox.ask_all(PING, Ping(), ident=f"{peer.service}-{peer.id}", timeout_s=SLOW_S)
+                inbox.ask_all(PING, Ping(), ident=f"{peer.service}-{peer.id}", timeout_s=READ_S)
 
-    def _tell(self, config: Config | None, *, connected: bool) -> None:
+    def _tell(self, config: Config | None, connected_s: float) -> None:
         """Renew the sections. The folder is looked at now and then."""
         worlds = {name: track.seen.world for name, track in self.tracks.items() if track.seen}
         sections: dict[str, object] = {
-            "state": {**self._state(config), "connected": connected},
+            "state": {**self._state(config), "connected": connected_s > 0.0},
             "robots": {name: track.shown() for name, track in self.tracks.items()},
             "trails": {n: [[*t.trail], [*t.bumps]] for n, t in self.tracks.items()},
             "maps": {world: map_of(world) for world in sorted(set(worlds.values()))},
             "told": self.told(),
         }
-        if time.monotonic() - self._slow_s >= SLOW_S:
-            self._slow_s = time.monotonic()
-            sections["findings"] = self._findings(self.snapshot)
-            if self.folder:
-                boxes = {name: self.folder.obstacles(name, world) for name, world in worlds.items()}
-                sections |= {"obstacles": boxes, "notes": self.folder.notes()}
-                curves = self.folder.curves()
-                sections |= {"curves": curves} if curves else {}
+        now_s, folder = time.monotonic(), self.folder
+        if folder and now_s - self._read_s >= READ_S:
+            self._read_s = now_s
+            boxes = {name: folder.obstacles(name, world) for name, world in worlds.items()}
+            sections |= {"obstacles": boxes, "notes": folder.notes()}
+            if curves := folder.curves():
+                sections["curves"] = curves
+        if folder and now_s - self._judged_s >= JUDGED_S:
+            self._judged_s = now_s
+            seen = self.snapshot if connected_s > JUDGED_S / 2 else None
+            sections["findings"] = folder.findings(seen)
         old = self.sections
         fresh = {name: json.dumps(what) for name, what in sections.items()}
         same = {name: old[name] for name, text in fresh.items() if old.get(name) == text}
@@ -180,11 +184,10 @@ class Watch:
     def _state(self, config: Config | None) -> dict[str, Any]:
         """What the heartbeats tell, how old they are, and what is wrong."""
         seen, heartbeat_s = self.snapshot, config.bus.heartbeat_s if config else 1.0
-        wrong = [*words.robot_warnings(seen), *words.service_warnings(seen, heartbeat_s)]
         told: dict[str, Any] = {
             "run": config.run.name if config else self.folder.path.name if self.folder else "",
             "lost": self.lost,
-            "warnings": wrong,
+            "warnings": warnings(RunView("", "", 0.0, seen, heartbeat_s=heartbeat_s)),
             "services": {
                 name: {
                     **entry.message.model_dump(),
@@ -195,9 +198,9 @@ class Watch:
                 for name, entry in seen.everybody.items()
                 for reply in [self._replies.get(entry.message.life)]
             },
-            "fitting": words.fit_share(seen.learner.message) if seen.learner else 0.0,
         }
         if seen.replay and seen.learner:
             told["replay"] = words.replay_doing(seen.replay.message)
             told["learner"] = words.learner_doing(seen.learner.message)
+            told["fitting"] = words.fit_share(seen.learner.message)
         return told
