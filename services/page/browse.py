@@ -28,8 +28,8 @@ from shared.rl.memory import Images, ReplayMemory
 
 PAGE, NEIGHBOURS, AGES = 48, 12, 8
 """Images of a page, neighbours of a sample, bars of the ages."""
-WAITING, CHILD_S, IDLE_S = 8, 60.0, 120.0
-"""Questions that may wait; how long torch may take; after how long without a question it goes."""
+CHILD_S, IDLE_S = 60.0, 120.0
+"""How long torch may take, and after how long without a question it goes."""
 Rows = npt.NDArray[np.void]
 
 
@@ -49,6 +49,9 @@ class Query(BaseModel):
     bits: Annotated[int, Field(ge=0, le=120)] | None = None
     """Only what a search with this threshold would mark."""
     page: Annotated[int, Field(ge=0, le=100_000)] = 0
+
+
+Answer = Callable[[Query], dict[str, Any]]
 
 
 class Catalogue(ReplayMemory):
@@ -71,32 +74,19 @@ class Browser:
     def __init__(self, run: Path | None) -> None:
         self._run = run or Path()
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="memory")
-        self._waiting = 0
         self._tables: Tables | None = None
         self._catalogue, self._position = Catalogue(1), Position(-1, 0, 0, 0, 1)
         self._child: ProcessPoolExecutor | None = None
         self._timer: Timer | None = None
         self._marked: dict[tuple[int, int], npt.NDArray[np.bool_]] = {}
-        self.answers: dict[str, Callable[[Query], dict[str, Any]]] = {
-            "overview": self.overview,
-            "samples": self.samples,
-            "sample": self.sample,
-            "prediction": self.prediction,
-            "discard": self.discard,
-        }
+        self.answers: tuple[Answer, ...] = (
+            *(self.overview, self.samples, self.sample, self.prediction, self.discard),
+        )
 
-    async def ask(
-        self, answer: Callable[[Query], dict[str, Any]], query: dict[str, Any]
-    ) -> dict[str, Any]:
+    async def ask(self, answer: Answer, query: dict[str, Any]) -> dict[str, Any]:
         """The answer, from the thread that owns the catalogue. Raises CorridorError, KeyError."""
-        wanted = Query.model_validate(query)
-        if self._waiting >= WAITING:
-            raise CorridorError("busy: too many questions about the memory at once")
-        self._waiting += 1
-        try:
-            return await asyncio.get_running_loop().run_in_executor(self._pool, answer, wanted)
-        finally:
-            self._waiting -= 1
+        wanted, loop = Query.model_validate(query), asyncio.get_running_loop()
+        return await loop.run_in_executor(self._pool, answer, wanted)
 
     def overview(self, _: Query) -> dict[str, Any]:
         """What is in the memory, counted."""
@@ -186,9 +176,8 @@ class Browser:
         told = self._shown(kept)
         for shown, mark, row in zip(told, page, kept, strict=True):
             why = "decree" if mark["forced"] else "alike" if mark["candidate"] else "age"
-            newer = memory.rows[memory.ids > mark["id"]]
-            near, bits = nearest(mark, row["action"], newer, 1)
-            like = self._shown(newer[near])
+            near, bits = nearest(mark, row["action"], memory.rows, 1, newer=True)
+            like = self._shown(memory.rows[near])
             shown |= {"why": why, "like": {**like[0], "bits": int(bits[0])} if like else None}
         reasons = {
             "decree": int(np.count_nonzero(gone["forced"])),
@@ -277,7 +266,7 @@ class Browser:
 
 
 def nearest(
-    mark: np.void, action: int, rows: Rows, count: int
+    mark: np.void, action: int, rows: Rows, count: int, *, newer: bool = False
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Places of the samples of the same action whose descriptors differ in the fewest bits.
 
@@ -285,7 +274,8 @@ def nearest(
     first. Returns places and bits.
     """
     alike = (rows["action"] == action) & (rows["described_by"] == mark["described_by"])
-    alike &= (rows["id"] != mark["id"]) & (mark["described_by"] > 0)
+    alike &= (rows["id"] > mark["id"]) if newer else (rows["id"] != mark["id"])
+    alike &= mark["described_by"] > 0
     own = np.flatnonzero(alike)[::-1]
     bits = np.bitwise_count(rows["descriptor"][own] ^ mark["descriptor"]).sum(axis=1)
     chosen = np.argsort(bits, kind="stable")[:count]

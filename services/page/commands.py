@@ -67,13 +67,11 @@ class Told:
     at: str
     what: str
     robot: str
-    ended: bool = False
     lines: list[str] = field(default_factory=list)
 
     def __call__(self, line: str) -> None:
         """Add a line."""
-        del self.lines[: -LINES + 1]
-        self.lines.append(line)
+        self.lines = [*self.lines, line][-LINES:]
 
 
 class Desk:
@@ -128,7 +126,6 @@ class Desk:
             told(f"failed: {error!r}")
             raise
         finally:
-            told.ended = True
             with self._lock:
                 self._under_way[command.order in HALTS] -= 1
 

@@ -12,7 +12,6 @@ import secrets
 import socket
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any
 
 import anyio
 import uvicorn
@@ -26,7 +25,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from services.page.address import Address, Guard
-from services.page.browse import Browser, Query
+from services.page.browse import Answer, Browser
 from services.page.commands import MOST_BYTES, Command, Desk
 from services.page.metrics import Figures
 from services.page.watch import PERIOD_S, Watch
@@ -107,10 +106,7 @@ class Server:
         routes = [
             WebSocketRoute("/updates", self._updates),
             Route("/metrics", self._metrics),
-            *(
-                Route(f"/memory/{name}", self._answering(answer))
-                for name, answer in memory.answers.items()
-            ),
+            *(Route(f"/memory/{a.__name__}", self._answering(a)) for a in memory.answers),
             Mount("/", StaticFiles(directory=STATIC, html=True)),
         ]
         self.app = Guard(Starlette(routes=routes), address.hosts)
@@ -136,9 +132,7 @@ class Server:
     async def _metrics(self, _: Request) -> Response:
         return Response(generate_latest(self._registry), media_type=CONTENT_TYPE_LATEST)
 
-    def _answering(
-        self, answer: Callable[[Query], dict[str, Any]]
-    ) -> Callable[[Request], Awaitable[Response]]:
+    def _answering(self, answer: Answer) -> Callable[[Request], Awaitable[Response]]:
         async def respond(request: Request) -> Response:
             try:
                 return JSONResponse(await self._memory.ask(answer, dict(request.query_params)))
@@ -151,15 +145,7 @@ class Server:
 
     def serve(self, place: socket.socket) -> None:
         """Answer until SIGTERM or Ctrl-C."""
-        uvicorn.Server(
-            uvicorn.Config(
-                self.app,
-                log_config=None,
-                access_log=False,
-                lifespan="off",
-                ws="websockets-sansio",
-                ws_max_size=2 * MOST_BYTES,
-                limit_concurrency=128,
-                timeout_graceful_shutdown=1,
-            )
-        ).run([place])
+        config = uvicorn.Config(self.app, log_config=None, access_log=False, lifespan="off")
+        config.ws, config.ws_max_size = "websockets-sansio", 2 * MOST_BYTES
+        config.limit_concurrency, config.timeout_graceful_shutdown = 128, 1
+        uvicorn.Server(config).run([place])

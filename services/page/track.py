@@ -14,8 +14,8 @@ import numpy as np
 
 from shared.messages import Action, Observation
 
-STEP_M = 0.08
-"""Places of the trail lie at least so far apart."""
+STEP_M, JUMP_M = 0.08, 0.6
+"""Places of the trail lie at least so far apart; over a longer way it breaks off."""
 TRAIL, BUMPS, DELAYS, WAITING = 400, 60, 500, 64
 """Places, bumps, delays and unanswered observations that are kept."""
 
@@ -26,7 +26,7 @@ class Track:
     def __init__(self) -> None:
         self.seen: Observation | None = None
         self.chosen: Action | None = None
-        self.trail: deque[tuple[float, float]] = deque(maxlen=TRAIL)
+        self.trail: deque[tuple[float, float] | None] = deque(maxlen=TRAIL)
         self.bumps: deque[tuple[float, float]] = deque(maxlen=BUMPS)
         self.delays_ms: deque[float] = deque(maxlen=DELAYS)
         """From an observation to its answer, as both arrived here."""
@@ -38,9 +38,12 @@ class Track:
         if before and before.world != seen.world:
             self.trail.clear()
             self.bumps.clear()
+        last = (self.trail[-1] if self.trail else None) or place
         if seen.bump and not (before and before.sequence == seen.sequence):
-            self.bumps.append(self.trail[-1] if self.trail else place)
-        if not self.trail or math.dist(self.trail[-1], place) >= STEP_M:
+            self.bumps.append(last)
+        if math.dist(last, place) >= JUMP_M:
+            self.trail.append(None)
+        if not self.trail or math.dist(last, place) >= STEP_M:
             self.trail.append(place)
         self.seen = seen
         self._waiting.setdefault((seen.life, seen.sequence, seen.attempt), at_s)

@@ -35,7 +35,7 @@ PERIOD_S, IDLE_PERIOD_S = 0.2, 1.0
 READ_S, JUDGED_S, AWAY_S = 2.0, 10.0, 3.0
 """How often the folder is read and services are asked, how often the run is judged; how long a
 router may be away."""
-KEPT = 256
+KEPT = 1024
 """Messages of one sender between two looks."""
 
 

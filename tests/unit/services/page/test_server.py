@@ -144,7 +144,7 @@ def test_orders_without_a_router_are_told_as_not_sent(watch: Watch, tmp_path: Pa
     for command in (Command(order="estop"), Command(note="it circles")):
         desk.take(command).join(10.0)
     stop, note = desk.told()
-    assert (stop["what"], stop["robot"], stop["ended"]) == ("emergency stop", "all robots", True)
+    assert (stop["what"], stop["robot"]) == ("emergency stop", "all robots")
     assert stop["lines"] == ["NOT sent: no router answers"]
     assert note["lines"] == ["kept at episode 9"]
 

@@ -65,3 +65,5 @@ def test_a_robot_that_stands_leaves_no_trail() -> None:
     for sequence in range(10):
         track.observe(make_observation(sequence, x_m=0.001 * sequence), 0.0)
     assert len(track.trail) == 1
+    track.observe(make_observation(10, x_m=5.0), 0.0)
+    assert list(track.trail)[1:] == [None, (5.0, 0.0)]  # nobody saw the way there
