@@ -1,0 +1,60 @@
+"""Whether a person drives a robot in place of the network, and what they want now. No clock."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from shared.messages import Takeover
+
+WISH_S = 0.3
+"""How long a wish for an action holds; a commander says it again more often."""
+HOLDER_SILENT_S = 3.0
+"""After this time another person may take the robot over, or give it back."""
+
+
+class Hand:
+    """Who took the robot over keeps it until it is given back.
+
+    One person drives at a time. A person who is gone leaves a robot that stands.
+
+    Args:
+        path: A file that is there while the robot is taken over, so that no restart of the actor
+            lets the network drive.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.taken = path.exists()
+        self.life = ""
+        """Of the commander that was heard last."""
+        self.refused = 0
+        """Messages of another person than the one who drives, or out of order."""
+        self._number = -1
+        self._heard_s = float("-inf")
+        self._action: int | None = None
+
+    def note(self, wish: Takeover, now_s: float) -> None:
+        """Take a message, which counts as made now."""
+        if wish.life != self.life:
+            if self.taken and self.silent_s(now_s) < HOLDER_SILENT_S:
+                self.refused += 1
+                return
+            self.life, self._number = wish.life, -1
+        if wish.number <= self._number:
+            self.refused += 1
+            return
+        self._number, self._heard_s, self._action = wish.number, now_s, wish.action
+        if wish.give_back:
+            self._path.unlink(missing_ok=True)
+        elif not self.taken:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._path.touch()
+        self.taken = not wish.give_back
+
+    def silent_s(self, now_s: float) -> float:
+        """How long nothing was heard; without end before the first message."""
+        return now_s - self._heard_s
+
+    def wish(self, now_s: float) -> int | None:
+        """The action that the person wants now; None: the robot is to stand."""
+        return self._action if self.taken and self.silent_s(now_s) < WISH_S else None
