@@ -49,7 +49,7 @@ class SingleProcess:
     """Driver, actor, replay and learner of one robot as plain objects."""
 
     def __init__(self, config: Config, robot: SimRobot, person: Person | None = None) -> None:
-        """person: drives in place of the network. Raises ConfigError where one is missing."""
+        """person: drives while the memory is filled. Raises ConfigError where one is missing."""
         if config.memory.fill == "human" and person is None:
             raise ConfigError("memory.fill 'human': expected a person who drives, got none")
         self.config, self._person = config, person
@@ -87,7 +87,7 @@ class SingleProcess:
                 done = self._turn(submission)
                 self.actor.committed(self._progress())
                 yield done
-            wish = self._person(observation) if self._person else None
+            wish = self._person(observation) if self._person and self.actor.filling else None
             action = self.actor.act(observation, wish=wish)
             assert action.action is not None
             if self.env.driver.apply_due(action.episode):

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from shared.messages import Takeover
 
 WISH_S = 0.3
 """How long a wish for an action holds; a commander says it again more often."""
+HOLD_AFTER = 0.7
+"""Part of a period after which a robot that stands anyway is told to hold."""
 HOLDER_SILENT_S = 3.0
 """After this time another person may take the robot over, or give it back."""
 
@@ -32,6 +35,9 @@ class Hand:
         self._number = -1
         self._heard_s = float("-inf")
         self._action: int | None = None
+        self._moves = False
+        """Whether the last answer was an action."""
+        self._look_s = self._act_s = 0.0
 
     def note(self, wish: Takeover, now_s: float) -> None:
         """Take a message, which counts as made now."""
@@ -50,6 +56,32 @@ class Hand:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._path.touch()
         self.taken = not wish.give_back
+
+    def looked(self, now_s: float) -> None:
+        """The robot sent an observation that it was not asked about before."""
+        self._look_s = now_s
+
+    def acted(self, now_s: float) -> None:
+        """It was answered with an action."""
+        self._moves, self._act_s = True, now_s
+
+    def held(self) -> None:
+        """It was told to stand."""
+        self._moves = False
+
+    def turn(
+        self, now_s: float, period_s: float, *, realtime: bool
+    ) -> tuple[Literal["act", "wait", "hold"], int | None]:
+        """What becomes of the newest observation now, and the person's action.
+
+        A person drives no faster than real time. A robot that stands already is told to hold only
+        as its period ends: a wish that comes before is not late for this period.
+        """
+        wish = self.wish(now_s)
+        if wish is not None and (realtime or now_s - self._act_s >= period_s):
+            return "act", wish
+        due = self._moves or now_s - self._look_s > HOLD_AFTER * period_s
+        return ("hold" if due else "wait"), None
 
     def silent_s(self, now_s: float) -> float:
         """How long nothing was heard; without end before the first message."""

@@ -25,8 +25,6 @@ from shared.service import TICK_S, Service, new_life
 from shared.weights import WeightsFetcher
 
 Phase = Literal["waiting", "filling", "driving", "handing-over", "training", "person", "stopped"]
-HOLD_AFTER = 0.7
-"""Part of a period after which a robot that a person lets stand is told so."""
 PERSON_TICK_S = 0.02
 MOST_SILENT_S = 1e9
 
@@ -62,8 +60,6 @@ class Session:
         self.hand = Hand(path.with_suffix(".taken"))
         self._wish: int | None = None
         """The person's action for the observation that `advance` returned."""
-        self._look_s = self._act_s = 0.0
-        """When the newest observation came, and when one was answered last with an action."""
         self._pending: Episode | None = None
         """Finished, not yet acknowledged."""
         self._observation: Observation | None = None
@@ -99,7 +95,8 @@ class Session:
             self._publish(answered[1])  # our answer was lost
             return
         if self._observation is None or place != self._place(self._observation):
-            self._observation, self._look_s = observation, served.heard_s
+            self._observation = observation
+            self.hand.looked(served.heard_s)
             if self.actor.progress is not None:
                 self._finish(observation)
 
@@ -151,25 +148,17 @@ class Session:
         return self.hand.taken or (self.actor.filling and self._me.config.memory.fill == "human")
 
     def _as_person_wants(self, observation: Observation) -> Observation | None:
-        """Let a person drive: no faster than real time, and only while they want it.
-
-        A robot that stands, or may, is told to hold only as its period ends: a wish that comes
-        before is not late for this period.
-        """
-        now_s, period_s = time.monotonic(), observation.period_s
-        self._wish = self.hand.wish(now_s)
-        paced = self._me.config.robot.timing == "realtime" or now_s - self._act_s >= period_s
-        if self._wish is not None and paced:
-            return observation
-        moves = self._answered is not None and self._answered[1].action is not None
-        if moves or now_s - self._look_s > HOLD_AFTER * period_s:
+        """Let a person drive."""
+        realtime = self._me.config.robot.timing == "realtime"
+        do, self._wish = self.hand.turn(time.monotonic(), observation.period_s, realtime=realtime)
+        if do == "hold":
             self._hold(observation)
-        return None
+        return observation if do == "act" else None
 
     def answer(self, observation: Observation, values: Values) -> None:
         """Act on what `advance` returned, given what `actor.predictor` says of its image."""
         action = self.actor.act(observation, values, self._wish)
-        self._act_s = time.monotonic()
+        self.hand.acted(time.monotonic())
         self._answered = (self._place(observation), action)
         self._observation = None
         self._publish(action)
@@ -324,6 +313,7 @@ class Session:
         if self._me.config.robot.timing != "realtime":
             return
         self._observation = None
+        self.hand.held()
         self._publish(
             Action(
                 robot=self._robot,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from concurrent.futures import Future
 from pathlib import Path
+from threading import Event
 from types import SimpleNamespace
 from typing import Any
 
@@ -63,6 +64,8 @@ class Rig:
         self.sent: list[Episode] = []
         self.on_its_way: Future[Delivery] = Future()
         me = SimpleNamespace(
+            ident="main",
+            stop=Event(),
             config=make_config(robot={"timing": timing}, **given),
             log=logging.getLogger("actor"),
             bus=SimpleNamespace(publish=lambda _, action, __: self.published.append(action)),
@@ -207,7 +210,7 @@ def test_in_lockstep_a_person_drives_no_faster_than_real_time(
     takeover(rig, 3, 1, clock.s)
     rig.see(1)
     assert driven(rig) == [(2, "human"), (1, "human")]
-    clock.s += 0.3  # they let go, or are gone
+    clock.s += 0.4  # they let go, or are gone
     rig.see(2)
     assert len(rig.published) == 2
     assert rig.session.heartbeat(0, 0).phase == "person"
@@ -231,7 +234,7 @@ def test_in_real_time_letting_go_stops_at_once_and_a_key_starts_within_the_perio
     takeover(rig, 2, 1, clock.s)
     rig.see(1, attempt=1)
     assert driven(rig)[2:] == [(1, "human")]
-    clock.s += 0.3
+    clock.s += 0.4
     rig.see(2)
     rig.see(2, attempt=1)
     clock.s += 0.2
