@@ -152,12 +152,7 @@ class Actor:
         episode = progress.robot_fills if progress.filling else progress.robot_episodes
         chosen: tuple[int, Chooser] | None = None if wish is None else (wish, "human")
         action, by = chosen or decide(
-            self._config,
-            self._robot,
-            values,
-            filling=progress.filling,
-            episode=episode,
-            step=number,
+            self._config, self._robot, values, filling=self.filling, episode=episode, step=number
         )
         self._append(observation, action, float(values.max()), episode, CHOOSERS.index(by))
         self.actions += 1

@@ -35,6 +35,8 @@ class Hand:
         self._number = -1
         self._heard_s = float("-inf")
         self._action: int | None = None
+        self.chosen: int | None = None
+        """The person's action that is to be taken now."""
         self._moves = False
         """Whether the last answer was an action."""
         self._look_s = self._act_s = 0.0
@@ -71,17 +73,18 @@ class Hand:
 
     def turn(
         self, now_s: float, period_s: float, *, realtime: bool
-    ) -> tuple[Literal["act", "wait", "hold"], int | None]:
-        """What becomes of the newest observation now, and the person's action.
+    ) -> Literal["act", "wait", "hold"]:
+        """What becomes of the newest observation now; act: as `chosen`.
 
         A person drives no faster than real time. A robot that stands already is told to hold only
         as its period ends: a wish that comes before is not late for this period.
         """
         wish = self.wish(now_s)
         if wish is not None and (realtime or now_s - self._act_s >= period_s):
-            return "act", wish
+            self.chosen = wish
+            return "act"
         due = self._moves or now_s - self._look_s > HOLD_AFTER * period_s
-        return ("hold" if due else "wait"), None
+        return "hold" if due else "wait"
 
     def silent_s(self, now_s: float) -> float:
         """How long nothing was heard; without end before the first message."""

@@ -58,8 +58,6 @@ class Session:
         """The open episode is of an earlier process; `Actor.begin` has not judged it yet."""
         self.actor = Actor(me.config, robot, life, targets.none)
         self.hand = Hand(path.with_suffix(".taken"))
-        self._wish: int | None = None
-        """The person's action for the observation that `advance` returned."""
         self._pending: Episode | None = None
         """Finished, not yet acknowledged."""
         self._observation: Observation | None = None
@@ -132,7 +130,7 @@ class Session:
         if ready and self._of_person:
             return self._as_person_wants(self._observation)
         if ready:
-            self._wish = None
+            self.hand.chosen = None
             return self._observation
         self._hold(self._observation)
         return None
@@ -150,14 +148,14 @@ class Session:
     def _as_person_wants(self, observation: Observation) -> Observation | None:
         """Let a person drive."""
         realtime = self._me.config.robot.timing == "realtime"
-        do, self._wish = self.hand.turn(time.monotonic(), observation.period_s, realtime=realtime)
+        do = self.hand.turn(time.monotonic(), observation.period_s, realtime=realtime)
         if do == "hold":
             self._hold(observation)
         return observation if do == "act" else None
 
     def answer(self, observation: Observation, values: Values) -> None:
         """Act on what `advance` returned, given what `actor.predictor` says of its image."""
-        action = self.actor.act(observation, values, self._wish)
+        action = self.actor.act(observation, values, self.hand.chosen)
         self.hand.acted(time.monotonic())
         self._answered = (self._place(observation), action)
         self._observation = None

@@ -18,7 +18,7 @@ from services.processes import MAIN
 from shared.bus import Bus
 from shared.config import Config
 from shared.errors import PeerMissing
-from shared.facts import ACTIONS
+from shared.facts import ACTIONS, FORWARD, FORWARD_LEFT, FORWARD_RIGHT
 from shared.keys import ACTOR_STATE, TAKEOVER
 from shared.messages import ActorState, Takeover
 from shared.service import StopFlag, answer_signals, new_life
@@ -28,7 +28,8 @@ WISH_PERIOD_S = 0.05
 FAREWELL_S = 3.0
 """How long the actor is told that the robot is given back, until it shows that it knows."""
 HELP = (
-    "w or up: forward   a/d or left/right: forward/left, forward/right   let go: stand   "
+    f"w or up: {ACTIONS[FORWARD].name}   a or left: {ACTIONS[FORWARD_LEFT].name}   "
+    f"d or right: {ACTIONS[FORWARD_RIGHT].name}   let go: stand   "
     "e: emergency stop (corridor clear)   q: give the robot back to its network"
 )
 
