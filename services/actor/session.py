@@ -44,9 +44,8 @@ class Session:
         courier: Courier,
         lives: Callable[[], Collection[str]],
     ) -> None:
-        """Begin to serve a robot.
+        """Serve a robot. No two sessions have the same life: under it episodes count from 0.
 
-        life: under which episodes are counted from 0, so no two sessions have the same.
         lives: which of its driver's lives have the role now.
         """
         self._me, self._robot, self._path = me, robot, path
