@@ -19,7 +19,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 BESIDE := -n 4 --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-full check lint unit system mutants compose-test extras-test page-test bench profile bench-full bench-peers clean
+.PHONY: help setup demo test test-full check lint unit system mutants compose-test extras-test page-test docs bench profile bench-full bench-peers clean
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
 
@@ -62,6 +62,8 @@ extras-test: $(VENV)/.dev ## every extra from the wheel, in an environment that 
 
 page-test: $(VENV)/.dev ## the web page in a browser: every control, outages, accessibility
 	$(BIN)/python -m tests.page.trial $(ARGS)
+docs: $(VENV)/.docs ## write the documentation as a site into site/
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
 
 bench: $(VENV)/.dev ## measure speed and memory, in minutes; the machine should do nothing else
 	$(BIN)/python -m benchmarks.run_all --short
@@ -83,6 +85,10 @@ clean: ## remove the virtual environments and all caches; runs stay
 
 $(VENV)/.dev: $(VENV)/.all
 	$(PIP) install --constraint constraints.txt --editable '.[all,dev]'
+	@touch $@
+
+$(VENV)/.docs: $(VENV)/.all
+	$(PIP) install --constraint constraints.txt --editable '.[docs]'
 	@touch $@
 
 $(VENV)/.all: pyproject.toml constraints.txt $(VENV)/.made

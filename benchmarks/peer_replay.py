@@ -64,7 +64,9 @@ class Ours:
 
     def insert(self, episode: Episode) -> None:
         """Send samples; they are on disk when this returns."""
-        ack = self._client.request(EPISODE, episode, EpisodeAck, timeout_s=30.0)
+        ack = self._client.request(
+            EPISODE, episode, EpisodeAck, ident=episode.robot, timeout_s=30.0
+        )
         assert ack.accepted, ack.reason
         assert ack.stored == episode.count
 

@@ -55,6 +55,7 @@ def make_episode(number: int, samples: int, *, fill: bool, images: Images | None
         sample_episodes=np.full(samples, number, "<u4").tobytes(),
         sample_versions=np.ones(samples, "<u4").tobytes(),
         sample_worlds=bytes(samples),
+        sample_by=bytes(samples),
         positions=bytes(12 * samples),
         robot_life=LIFE,
         last_sequence=(number + 1) * samples - 1,

@@ -35,7 +35,7 @@ def answer(seen: Observation, action: int) -> Action:
         sequence=seen.sequence,
         attempt=seen.attempt,
         action=action,
-        greedy=False,
+        by="network",
         values=(0.0, 0.0, 0.0),
         weights_version=1,
     )

@@ -77,7 +77,7 @@ def acknowledged_once(client: Bus, number: int) -> float:
     """Seconds from sending the episode with this number to its acknowledgement."""
     episode = make_episode(number, EPISODE_SAMPLES, fill=False)
     start_s = time.perf_counter()
-    ack = client.request(EPISODE, episode, EpisodeAck, timeout_s=30.0)
+    ack = client.request(EPISODE, episode, EpisodeAck, ident=episode.robot, timeout_s=30.0)
     spent_s = time.perf_counter() - start_s
     assert ack.accepted, ack.reason
     return spent_s

@@ -10,7 +10,7 @@ rewards, memory, marks and weights, bit for bit; tests/system compares the two.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,7 @@ from services.replay import numbering
 from services.replay.numbering import Counters
 from services.robot_driver.simulated.sim import SimRobot
 from shared.config import Config
+from shared.errors import ConfigError
 from shared.messages import Episode, Observation, RobotProgress
 from shared.rl.learning import Trained, Trainer
 from shared.rl.memory import ReplayMemory
@@ -28,6 +29,9 @@ from shared.rl.network import to_bytes
 from shared.rl.predictor import Predictor
 from shared.rl.schedule import Moment
 from shared.rl.turn import Commit, Maintenance, maintain, sample_rows
+
+Person = Callable[[Observation], int | None]
+"""The action that a person wants; None: they leave it to the network."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +48,11 @@ class TurnDone:
 class SingleProcess:
     """Driver, actor, replay and learner of one robot as plain objects."""
 
-    def __init__(self, config: Config, robot: SimRobot) -> None:
-        self.config = config
+    def __init__(self, config: Config, robot: SimRobot, person: Person | None = None) -> None:
+        """person: drives while the memory is filled. Raises ConfigError where one is missing."""
+        if config.memory.fill == "human" and person is None:
+            raise ConfigError("memory.fill 'human': expected a person who drives, got none")
+        self.config, self._person = config, person
         self.env = CorridorEnv(config=config, robot=robot)
         self.acting = Predictor(config.network, config.numerics.actor)
         self.actor = Actor(config, config.robot.id, LIFE, self.acting)
@@ -80,7 +87,8 @@ class SingleProcess:
                 done = self._turn(submission)
                 self.actor.committed(self._progress())
                 yield done
-            action = self.actor.act(observation)
+            wish = self._person(observation) if self._person and self.actor.filling else None
+            action = self.actor.act(observation, wish=wish)
             assert action.action is not None
             if self.env.driver.apply_due(action.episode):
                 observation = self.env.observe()

@@ -53,6 +53,7 @@ EPISODE = Columns(
     sample_episodes="<u4",
     sample_versions="<u4",
     sample_worlds="u1",
+    sample_by="u1",
     positions=np.dtype(("<f4", 3)),
 )
 """The samples of an `Episode`."""

@@ -307,8 +307,12 @@ class MemoryConfig(Section):
     """N grows up to this when a search finds too few candidates; 0: never (A44, E32)."""
     capacity_step: int = Field(default=0, ge=0, le=5_000_000)
     """How much N grows at a time; 0: 5000, scaled with `capacity` (A44, E17b)."""
-    fill: Literal["random", "policy", "none"] = "random"
-    """How the memory is filled before the first episode (A13, E9)."""
+    fill: Literal["random", "policy", "human", "none"] = "random"
+    """How the memory is filled before the first episode (A13, E9). human: by a person's actions
+    (`corridor takeover`), until it is full."""
+    keep_human: bool = True
+    """Whether samples of actions that a person chose are stored, like any others. An episode
+    without others is not counted then."""
     strategy: StrategyName = "rmm"
     """Which samples are discarded when the memory is full (A28-A34)."""
     rule: Literal["paper", "cover"] = "paper"

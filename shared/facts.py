@@ -7,7 +7,7 @@ message) is derived. This file imports nothing of ours and needs the standard li
 from __future__ import annotations
 
 import re
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 IMAGE_HEIGHT, IMAGE_WIDTH = 50, 75
 """Pixels of the grey image that the network sees (A22)."""
@@ -42,6 +42,11 @@ SHORT_NAMES = tuple(action.short for action in ACTIONS)
 FORWARD, FORWARD_LEFT, FORWARD_RIGHT = (SHORT_NAMES.index(s) for s in ("forward", "left", "right"))
 MIRRORED = tuple(SHORT_NAMES.index(action.mirror) for action in ACTIONS)
 """Number of each action as it looks in a mirror."""
+
+Chooser = Literal["network", "chance", "human"]
+"""Who chose an action: the network's prediction, chance (to explore or to fill), a person."""
+CHOOSERS = get_args(Chooser)
+HUMAN = CHOOSERS.index("human")
 
 DEFAULT_RUN, DEFAULT_ENDPOINT = "demo", "tcp/127.0.0.1:7447"
 """Name of a run, and where its router is, if nobody says otherwise."""

@@ -133,6 +133,7 @@ def _request(
 #                       name             key                             message         from          to                              rate                                                 at most
 OBSERVATION   = _latest("observation",   "{run}/robot/{id}/observation", m.Observation,  ("driver",),  ("actor", *LOOKING),            "one per action",                                    8 * KIB)
 ACTION        = _latest("action",        "{run}/actor/{id}/action",      m.Action,       ("actor",),   ("driver", *LOOKING),           "one per observation",                               2 * KIB)
+TAKEOVER      = _latest("takeover",      "{run}/takeover/{id}",          m.Takeover,     ("operator",), ("actor",),                    "10 Hz while a person drives",                       1 * KIB)
 ROBOT_STATE   = _latest("robot_state",   "{run}/robot/{id}/state",       m.RobotState,   ("driver",),  LOOKING,                        "1 Hz",                                              4 * KIB)
 ACTOR_STATE   = _latest("actor_state",   "{run}/actor/{id}/state",       m.ActorState,   ("actor",),   LOOKING,                        "1 Hz",                                              4 * KIB)
 REPLAY_STATE  = _latest("replay_state",  "{run}/replay/main/state",      m.ReplayState,  ("replay",),  ("learner", "actor", *LOOKING), "1 Hz and at every turn",                            4 * KIB)
@@ -154,7 +155,7 @@ PING         = _request("ping",         "{run}/service/{id}/ping",        m.Ping
 STOP         = _request("stop",         "{run}/service/{id}/stop",        m.StopService,      (m.ServiceReply,),     ("operator",),                 SERVING,      "rare",                           1 * KIB,  16)
 
 STREAMS: tuple[Stream, ...] = (
-    OBSERVATION, ACTION, HALT, RELEASE, ROBOT_STATE, ROBOT_WORLD, ACTOR_STATE,
+    OBSERVATION, ACTION, TAKEOVER, HALT, RELEASE, ROBOT_STATE, ROBOT_WORLD, ACTOR_STATE,
     EPISODE, PROGRESS, REPLAY_STATE, TURNS, CHANGES, SNAPSHOT, MINI_BATCH,
     LEARNER_STATE, WEIGHTS, PING, STOP,
 )

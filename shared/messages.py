@@ -15,9 +15,9 @@ import numpy.typing as npt
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from shared.columns import CHANGES, EPISODE
-from shared.facts import ACTION_COUNT, ACTIONS, IMAGE_BYTES, IMAGE_SHAPE, NAME
+from shared.facts import ACTION_COUNT, ACTIONS, CHOOSERS, IMAGE_BYTES, IMAGE_SHAPE, NAME, Chooser
 
-PROTOCOL_VERSION = 2
+PROTOCOL_VERSION = 3
 MAX_EPISODE_SAMPLES = 5000
 """More samples than this in one episode are refused, whatever the configuration says."""
 
@@ -139,7 +139,7 @@ class Action(Message):
     motion: Motion = ""
     """Move like this for one period. `action` is None then. A driver that cannot do it holds still.
     It counts as no action: `sequence` stays, and the next observation says "moved"."""
-    greedy: bool
+    by: Chooser
     values: ActionValues
     """Clipped predictions Q(s, a) of all actions, for the monitor."""
     weights_version: Count
@@ -159,6 +159,24 @@ class Action(Message):
         if self.motion and self.action is not None:
             raise ValueError(f"motion {self.motion!r}: expected no action beside it")
         return self
+
+
+class Takeover(Message):
+    """What a person wants of a robot that learns, said again and again. Operator to actor.
+
+    The first one takes the robot over: from then on it moves only while wishes for an action keep
+    coming. It stays so, also in silence, until it is given back.
+    """
+
+    robot: Ident
+    life: Life
+    """Of the process by which the person drives. One drives at a time."""
+    number: Count
+    """Grows with every message of a life; one that comes late does nothing."""
+    action: ActionNumber | None
+    """None: stand."""
+    give_back: bool = False
+    """The network drives again."""
 
 
 MAX_HALTS, MAX_RELEASED = 64, 256
@@ -392,6 +410,8 @@ class Episode(Message):
     """uint32 [n]: weights version that chose each action, at most `weights_version`."""
     sample_worlds: bytes
     """uint8 [n]: index into `worlds`."""
+    sample_by: bytes
+    """uint8 [n], who chose each action: index into `facts.CHOOSERS`."""
     positions: bytes
     """float32 [n, 3]: x_m, y_m, heading_rad at each sample."""
     robot_life: Life
@@ -414,6 +434,8 @@ class Episode(Message):
             raise ValueError(f"sample_actions: expected 0..{ACTION_COUNT - 1}, got {most}")
         if max(self.sample_worlds) >= len(self.worlds):
             raise ValueError("sample_worlds: index outside worlds")
+        if (most := max(self.sample_by)) >= len(CHOOSERS):
+            raise ValueError(f"sample_by: expected 0..{len(CHOOSERS) - 1}, got {most}")
         rewards = np.frombuffer(self.sample_rewards, "<f4")
         if not bool(np.all(np.abs(rewards) <= 1.0)):  # also false for NaN
             raise ValueError("sample_rewards: expected -1..1")
@@ -677,7 +699,18 @@ class ActorState(Message):
     id: Ident
     life: Life
     robot: Ident
-    phase: Literal["waiting", "filling", "driving", "handing-over", "training", "stopped"]
+    phase: Literal["waiting", "filling", "driving", "handing-over", "training", "person", "stopped"]
+    """person: the robot waits for a person, or is driven by one."""
+    taken_over: bool = False
+    """By a person; it stands unless they say otherwise, until they give it back."""
+    person: Life | Literal[""] = ""
+    """`Takeover.life` of the person heard last."""
+    person_silent_s: Seconds = 0.0
+    """How long nothing was heard of them, while it is taken over."""
+    human_actions: Count = 0
+    """Actions that persons chose."""
+    refused_takeovers: Count = 0
+    """Messages of another person than the one who drives, or out of order."""
     step: Count
     """Samples in the open episode."""
     robot_episode: Count

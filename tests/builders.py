@@ -117,6 +117,7 @@ def make_episode(n: int, *, seed: int = 0, images: Images | None = None, **given
         "sample_episodes": np.full(n, seed, "<u4").tobytes(),
         "sample_versions": np.ones(n, "<u4").tobytes(),
         "sample_worlds": bytes(n),
+        "sample_by": bytes(n),
         "positions": rng.uniform(-5.0, 5.0, (n, 3)).astype("<f4").tobytes(),
         "robot_life": OTHER_LIFE,
         "last_sequence": 10_000 * seed + n - 1,

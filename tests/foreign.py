@@ -14,7 +14,7 @@ DEADLINE_S = 60.0
 
 
 def pack(name: str, /, **fields: Any) -> bytes:
-    return msgpack.packb({"v": 2, "t": name, **fields})
+    return msgpack.packb({"v": 3, "t": name, **fields})
 
 
 class Client:

@@ -46,7 +46,7 @@ MEMORY_MIB = 400
 """More than what is there at the beginning is too much."""
 ODD = (0, 1, -1, 2**31, 2**32, 2**63 - 1, -(2**63), 2**64 - 1, 1e308, -1e39, float("nan"),
        float("inf"), "", "x" * 5000, "\x1b[31m", "../..", b"", b"\x80" * 300, None, True, (), {},
-       ((),) * 50, {"v": 2})  # fmt: skip
+       ((),) * 50, {"v": 3})  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from services.robot_driver.atlas.planner import Planner
 from services.robot_driver.simulated.world import World
 from shared.config import ActorNumerics, PolicyConfig, RobotConfig
 from shared.messages import Observation, image_array
+from shared.rl.draws import generator
 from shared.rl.policy import choose, choose_uniformly
 
 Chooser = Callable[[Sequence[Observation], Sequence[np.random.Generator]], list[int]]
@@ -29,6 +30,8 @@ GRID_M, HEADINGS, HORIZON = 0.1, 36, 100
 """Tables of the planner: coarse, as they only guide it; each action is checked exactly."""
 KEEP_M = 0.2
 """Room that planned laps keep to all walls."""
+MISTAKES = 0.2
+"""Share of a demonstrator's actions that are by chance."""
 _OFF_PLAN_M = 1e-3
 IMAGES_PER_PASS = 8
 """Larger passes save little more time per image, and would be half empty with few robots."""
@@ -75,6 +78,22 @@ def uniform(
 ) -> list[int]:
     """Any actions: the floor of all figures."""
     return [choose_uniformly(draw) for draw in draws]
+
+
+def demonstrator(world: World, robot: RobotConfig, seed: int) -> Callable[[Observation], int]:
+    """In place of a person who shows how to drive: the planner, every fifth action by chance.
+
+    Without mistakes no sample would tell of a bump.
+    """
+    planned = Planned(world, robot)
+
+    def wish(observation: Observation) -> int:
+        draw = generator(seed, "person", observation.sequence)
+        if draw.random() < MISTAKES:
+            return choose_uniformly(draw)
+        return planned([observation], [draw])[0]
+
+    return wish
 
 
 class _Plan(NamedTuple):

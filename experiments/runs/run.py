@@ -15,6 +15,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from experiments.drives.choosers import demonstrator
 from experiments.plans.plan import Plan, stage_config
 from experiments.plans.scales import divisor_of
 from experiments.records import EVALUATION_COLUMNS
@@ -86,8 +87,10 @@ class Run:
         roles = {role: settle(first, folder, role, common) for role in get_args(Role)}
         self._numerics = first.numerics.model_copy(update=roles)
         config = self._config(0)
-        robot = SimRobot(config.robot, load_world(config.robot.world), seed)
-        self._loop = SingleProcess(config, robot)
+        world = load_world(config.robot.world)
+        shows = config.memory.fill == "human"
+        person = demonstrator(world, config.robot, seed) if shows else None
+        self._loop = SingleProcess(config, SimRobot(config.robot, world, seed), person)
         self._totals = Totals()
         self._driving = self._best = b""
         self._observer = Observer(plan, folder, config)

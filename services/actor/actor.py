@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from shared.columns import EPISODE
 from shared.config import Config
+from shared.facts import CHOOSERS, HUMAN, Chooser
 from shared.messages import Action, Episode, Observation, RobotProgress, image_array
 from shared.rl.decision import decide
 from shared.rl.episode import Ending, OpenEpisode, Release, Step, stale_steps, with_current_max_q
@@ -43,6 +44,8 @@ class Actor:
         self.progress: RobotProgress | None = None
         self.submissions = 0
         self.actions = 0
+        self.human_actions = 0
+        """Those that a person chose."""
         self.dropped_samples = 0
         self.dropped_episodes = 0
         self._unreported_samples = 0
@@ -101,13 +104,11 @@ class Actor:
         if self._expected is not None and self._expected[0] in observation.earlier:
             self._expected = (observation.life, self._expected[1])
         if len(self.open) and self._unexecuted(self.open.steps[-1], observation):
-            self.open.retract()
-            self.actions -= 1
+            self._take_back()
             self._expected = (observation.life, observation.sequence)
         elif len(self.open) and self._displaced(self.open.steps[-1], observation):
             self.foreign_actions += 1
-            self.open.retract()
-            self.actions -= 1
+            self._take_back()
             self._expected = (observation.life, -1)
         ending = self._ending(observation)
         if ending is None:
@@ -135,11 +136,13 @@ class Actor:
         self._lives.add(life)
         self._drop(samples=episode.count, episodes=1)
 
-    def act(self, observation: Observation, values: Values | None = None) -> Action:
+    def act(
+        self, observation: Observation, values: Values | None = None, wish: int | None = None
+    ) -> Action:
         """Choose an action with the current target network and append the step (A11, A26).
 
         values: its clipped Q of all actions for this observation, float32 [actions], where the
-        caller has already asked for them.
+        caller has already asked for them. wish: the action that a person chose in its place.
         """
         assert self.progress is not None, "begin() comes first"
         if values is None:
@@ -147,16 +150,13 @@ class Actor:
             values = self.predictor.all_values(image[np.newaxis])[0]
         progress, number = self.progress, len(self.open)
         episode = progress.robot_fills if progress.filling else progress.robot_episodes
-        action, greedy = decide(
-            self._config,
-            self._robot,
-            values,
-            filling=progress.filling,
-            episode=episode,
-            step=number,
+        chosen: tuple[int, Chooser] | None = None if wish is None else (wish, "human")
+        action, by = chosen or decide(
+            self._config, self._robot, values, filling=self.filling, episode=episode, step=number
         )
-        self._append(observation, action, float(values.max()), episode)
+        self._append(observation, action, float(values.max()), episode, CHOOSERS.index(by))
         self.actions += 1
+        self.human_actions += by == "human"
         self.at_boundary = False
         self._expected = (observation.life, observation.sequence + 1)
         return Action(
@@ -166,7 +166,7 @@ class Actor:
             sequence=observation.sequence,
             attempt=observation.attempt,
             action=action,
-            greedy=greedy,
+            by=by,
             values=tuple(map(float, values)),
             weights_version=self.predictor.version,
             episode=progress.robot_episodes,
@@ -175,7 +175,9 @@ class Actor:
             step=number,
         )
 
-    def _append(self, observation: Observation, action: int, max_q: float, episode: int) -> None:
+    def _append(
+        self, observation: Observation, action: int, max_q: float, episode: int, by: int
+    ) -> None:
         """Add a step to the open episode (A11)."""
         version = self.predictor.version
         self.open.add(
@@ -192,6 +194,7 @@ class Actor:
                 number=len(self.open),
                 robot_episode=episode,
                 sequence=observation.sequence,
+                by=by,
             )
         )
 
@@ -201,6 +204,7 @@ class Actor:
             "lives": sorted(self._lives),
             "foreign_actions": self.foreign_actions,
             "actions": self.actions,
+            "human_actions": self.human_actions,
             "dropped": [self.dropped_samples, self.dropped_episodes],
             "unreported": [self._unreported_samples, self._unreported_episodes],
             "actions_before": self._actions_before,
@@ -217,6 +221,7 @@ class Actor:
         """
         self._lives = {self.life, *map(str, state["lives"])}
         self.foreign_actions, self.actions = int(state["foreign_actions"]), int(state["actions"])
+        self.human_actions = int(state["human_actions"])
         self.dropped_samples, self.dropped_episodes = state["dropped"]
         self._unreported_samples, self._unreported_episodes = state["unreported"]
         self._actions_before = int(state["actions_before"])
@@ -254,6 +259,12 @@ class Actor:
             return "interrupted"
         return "full" if self.open.full else None
 
+    def _take_back(self) -> None:
+        """Forget the newest step: its action was not executed."""
+        self.human_actions -= self.open.steps[-1].by == HUMAN
+        self.actions -= 1
+        self.open.retract()
+
     def _drop(self, *, samples: int, episodes: int) -> None:
         self.dropped_samples += max(samples, 0)
         self.dropped_episodes += episodes
@@ -272,7 +283,8 @@ class Actor:
             config=self._config.reward,
         )
 
-    def _submission(self, release: Release, observation: Observation) -> Episode:
+    def _submission(self, release: Release, observation: Observation) -> Episode | None:
+        """What is to be stored; None where all of it is a person's and that is not to be kept."""
         version = self.predictor.version
         stale = stale_steps(release, version)
         steps = release.steps
@@ -282,10 +294,15 @@ class Actor:
             steps = with_current_max_q(steps, values, stale, version)
         bump = release.ending == "bump"
         rewards = self._rewards(steps, release.count, bump)
+        released = steps[: release.count]
+        keep_human = self._config.memory.keep_human
+        keep = [i for i, step in enumerate(released) if keep_human or step.by != HUMAN]
+        self._drop(samples=release.count - len(keep), episodes=int(not keep))
+        if not keep:
+            return None
         actions, self._actions_before = self.actions - self._actions_before, self.actions
         laps = (observation.laps_left, observation.laps_right)
         before, self._laps_before = self._laps_before, laps
-        released = steps[: release.count]
         settled = steps if release.ending == "interrupted" else released
         number, self.submissions = self.submissions, self.submissions + 1
         return Episode(
@@ -304,13 +321,11 @@ class Actor:
             last_sequence=settled[-1].sequence,
             laps_left=max(laps[0] - before[0], 0),
             laps_right=max(laps[1] - before[1], 0),
-            **_columns(released, rewards),
+            **_columns([released[i] for i in keep], rewards[keep]),
         )
 
 
-def _columns(
-    steps: tuple[Step, ...], rewards: np.ndarray[Any, np.dtype[np.float32]]
-) -> dict[str, Any]:
+def _columns(steps: Sequence[Step], rewards: npt.NDArray[np.float32]) -> dict[str, Any]:
     """The per-sample fields of an `Episode`, as bytes."""
     worlds = tuple(dict.fromkeys(step.world for step in steps))
     images = np.frombuffer(b"".join(step.image for step in steps), np.uint8)
@@ -325,6 +340,7 @@ def _columns(
                 "sample_episodes": [step.robot_episode for step in steps],
                 "sample_versions": [step.acted_version for step in steps],
                 "sample_worlds": [worlds.index(step.world) for step in steps],
+                "sample_by": [step.by for step in steps],
                 "positions": [(step.x_m, step.y_m, step.heading_rad) for step in steps],
             }
         ),

@@ -19,8 +19,8 @@ from shared.complaints import Complaints
 from shared.config import Config, Numerics
 from shared.errors import CorridorError, DiskFull
 from shared.inbox import Inbox
-from shared.keys import ACTOR_STATE, LEARNER_STATE, OBSERVATION
-from shared.messages import LearnerState, Observation, image_array
+from shared.keys import ACTOR_STATE, LEARNER_STATE, OBSERVATION, TAKEOVER
+from shared.messages import LearnerState, Observation, Takeover, image_array
 from shared.numerics import settle
 from shared.rl.predictor import Predictor
 from shared.service import TICK_S, Service, Stopped, new_life, service
@@ -60,6 +60,7 @@ class ActorLoop:
         self._inbox: Inbox = me.bus.inbox()
         for robot in me.config.run.robots or ("*",):
             self._inbox.subscribe(OBSERVATION, robot)
+            self._inbox.subscribe(TAKEOVER, robot)
         if not me.config.run.robots:
             self._inbox.watch(ACTOR.name)
         self._inbox.subscribe(LEARNER_STATE, MAIN)
@@ -73,7 +74,7 @@ class ActorLoop:
     def run(self) -> None:
         """Serve until stopped."""
         while not self._me.stop.is_set():
-            self._inbox.wait(TICK_S)
+            self._inbox.wait(min((s.tick_s for s in self._sessions.values()), default=TICK_S))
             for _, state in self._inbox.take(LEARNER_STATE, LearnerState):
                 if not self._newest.note(state, self._inbox.lives(LEARNER.name, MAIN)):
                     self._inbox.refused[LEARNER_STATE.name] += 1
@@ -87,6 +88,9 @@ class ActorLoop:
                     self._complaints.tell(
                         "room", f"robot {robot!r} is not served: no room, or a rest"
                     )
+            for robot, wish in self._inbox.take(TAKEOVER, Takeover):
+                if robot in self._sessions:
+                    self._sessions[robot].hand.note(wish, time.monotonic())
             self._answer()
             self._beat()
 

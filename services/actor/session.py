@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from services.actor.actor import Actor
 from services.actor.courier import Courier, Delivery
+from services.actor.hand import Hand
 from services.actor.heard import RIVAL_SILENT_S, Newest, ServedLife
 from services.actor.targets import Targets
 from shared import statefile
@@ -20,10 +21,12 @@ from shared.facts import ACTION_COUNT
 from shared.keys import ACTION
 from shared.messages import Action, ActorState, Episode, LearnerState, Observation, RobotProgress
 from shared.rl.policy import Values
-from shared.service import Service, new_life
+from shared.service import TICK_S, Service, new_life
 from shared.weights import WeightsFetcher
 
-Phase = Literal["waiting", "filling", "driving", "handing-over", "training", "stopped"]
+Phase = Literal["waiting", "filling", "driving", "handing-over", "training", "person", "stopped"]
+PERSON_TICK_S = 0.02
+MOST_SILENT_S = 1e9
 
 
 class Session:
@@ -41,9 +44,8 @@ class Session:
         courier: Courier,
         lives: Callable[[], Collection[str]],
     ) -> None:
-        """Begin to serve a robot.
+        """Serve a robot. No two sessions have the same life: under it episodes count from 0.
 
-        life: under which episodes are counted from 0, so no two sessions have the same.
         lives: which of its driver's lives have the role now.
         """
         self._me, self._robot, self._path = me, robot, path
@@ -54,6 +56,7 @@ class Session:
         self._restored = False
         """The open episode is of an earlier process; `Actor.begin` has not judged it yet."""
         self.actor = Actor(me.config, robot, life, targets.none)
+        self.hand = Hand(path.with_suffix(".taken"))
         self._pending: Episode | None = None
         """Finished, not yet acknowledged."""
         self._observation: Observation | None = None
@@ -90,6 +93,7 @@ class Session:
             return
         if self._observation is None or place != self._place(self._observation):
             self._observation = observation
+            self.hand.looked(served.heard_s)
             if self.actor.progress is not None:
                 self._finish(observation)
 
@@ -121,14 +125,37 @@ class Session:
                 self._restored = False
             self._finish(self._observation)  # it may have come meanwhile
         self._finish(self._observation)
-        if self._finished is self._observation and self._pending is None and self._may_act():
+        ready = self._finished is self._observation and self._pending is None and self._may_act()
+        if ready and self._of_person:
+            return self._as_person_wants(self._observation)
+        if ready:
+            self.hand.chosen = None
             return self._observation
         self._hold(self._observation)
         return None
 
+    @property
+    def tick_s(self) -> float:
+        """After which time it is to go on, whatever arrives."""
+        return PERSON_TICK_S if self._of_person and self._observation else TICK_S
+
+    @property
+    def _of_person(self) -> bool:
+        """Whether a person drives, or is to fill the memory."""
+        return self.hand.taken or (self.actor.filling and self._me.config.memory.fill == "human")
+
+    def _as_person_wants(self, observation: Observation) -> Observation | None:
+        """Let a person drive."""
+        realtime = self._me.config.robot.timing == "realtime"
+        do = self.hand.turn(time.monotonic(), observation.period_s, realtime=realtime)
+        if do == "hold":
+            self._hold(observation)
+        return observation if do == "act" else None
+
     def answer(self, observation: Observation, values: Values) -> None:
         """Act on what `advance` returned, given what `actor.predictor` says of its image."""
-        action = self.actor.act(observation, values)
+        action = self.actor.act(observation, values, self.hand.chosen)
+        self.hand.acted(time.monotonic())
         self._answered = (self._place(observation), action)
         self._observation = None
         self._publish(action)
@@ -164,6 +191,11 @@ class Session:
             resent_episodes=self.resent_episodes,
             undecodable=undecodable,
             busy=busy,
+            taken_over=self.hand.taken,
+            person=self.hand.life,
+            person_silent_s=min(self.hand.silent_s(now_s), MOST_SILENT_S) * self.hand.taken,
+            human_actions=self.actor.human_actions,
+            refused_takeovers=self.hand.refused,
             values=action.values if action else (0.0,) * ACTION_COUNT,
         )
 
@@ -278,6 +310,7 @@ class Session:
         if self._me.config.robot.timing != "realtime":
             return
         self._observation = None
+        self.hand.held()
         self._publish(
             Action(
                 robot=self._robot,
@@ -286,7 +319,7 @@ class Session:
                 sequence=observation.sequence,
                 attempt=observation.attempt,
                 action=None,
-                greedy=False,
+                by="network",
                 values=(0.0,) * ACTION_COUNT,
                 weights_version=self.actor.predictor.version,
                 episode=self.actor.progress.robot_episodes if self.actor.progress else 0,
@@ -309,4 +342,6 @@ class Session:
         learner = self._newest.state
         if self._observation is not None and learner and self._lags(progress, learner):
             return "training"
+        if self._of_person:
+            return "person"
         return "filling" if progress.filling else "driving"

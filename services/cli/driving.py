@@ -1,4 +1,4 @@
-"""Commands that drive without learning and that record: `drive`, `teleop`, `record` ..."""
+"""Commands that drive without learning and that record: `drive`, `teleop`, `takeover` ..."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ OneRobot = Annotated[
 
 def add_to(app: typer.Typer) -> None:
     """Add the commands."""
-    for command in (drive, teleop, record, playback):
+    for command in (drive, teleop, takeover, record, playback):
         app.command()(grouped(command))
     app.command("bundle")(pack)
 
@@ -117,6 +117,17 @@ def teleop(which: Which, robot: OneRobot = None) -> None:
     from services.commander import teleop as command
 
     raise typer.Exit(command.run(which.reach(*DRIVING), robot, typer.echo))
+
+
+def takeover(which: Which, robot: OneRobot = None) -> None:
+    """Drive a robot that learns by keys, in place of its network: w a d or arrows, q gives it back.
+
+    It moves only while keys keep coming and stands otherwise, until it is given back. What it sees
+    meanwhile becomes samples like any others, which say that a person chose.
+    """
+    from services.commander import takeover as command
+
+    raise typer.Exit(command.run(which.reach("operator"), robot, typer.echo))
 
 
 def record(

@@ -15,7 +15,7 @@ from shared import roles
 from shared.bus import Bus
 from shared.config import Config
 from shared.errors import ConfigError, PeerMissing, RobotTaken
-from shared.facts import ACTION_COUNT, NAME
+from shared.facts import ACTION_COUNT, NAME, Chooser
 from shared.inbox import Inbox
 from shared.keys import ACTION, OBSERVATION, Peer
 from shared.messages import PROTOCOL_VERSION, Action, Motion, Observation
@@ -71,6 +71,7 @@ class Commander:
         action: int | None = None,
         motion: Motion = "",
         values: tuple[float, ...] = NO_VALUES,
+        by: Chooser = "network",
     ) -> None:
         """Answer an observation: an action, a motion, or neither: hold still."""
         message = Action(
@@ -81,7 +82,7 @@ class Commander:
             attempt=observation.attempt,
             action=action,
             motion=motion,
-            greedy=action is not None,
+            by=by,
             values=values,
             weights_version=0,
         )
@@ -127,7 +128,7 @@ def commanding(config: Config, robot: str | None) -> Iterator[Commander]:
     answer_signals(stop)
     with Bus(config.bus, config.run.name) as bus:
         peers = bus.peers()
-        robot, fingerprint = _choose(config, peers, robot)
+        robot, fingerprint = choose_robot(config, peers, robot)
         life = new_life()
         refuse_others(peers, robot, life)
         me = Service(ACTOR.name, robot, life, config, bus, stop)
@@ -153,8 +154,11 @@ def refuse_others(peers: list[Peer], robot: str, life: str) -> None:
             )
 
 
-def _choose(config: Config, peers: list[Peer], robot: str | None) -> tuple[str, str]:
-    """The robot that is meant, and the fingerprint of its configuration."""
+def choose_robot(config: Config, peers: list[Peer], robot: str | None) -> tuple[str, str]:
+    """The robot that is meant, and the fingerprint of its configuration.
+
+    Raises ConfigError and PeerMissing as `commanding` does.
+    """
     drivers = {peer.id: peer for peer in peers if peer.service == DRIVER.name}
     if robot is None:
         if not drivers:

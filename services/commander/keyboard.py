@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Generic, Literal, TypeVar
 
+from shared.facts import FORWARD, FORWARD_LEFT, FORWARD_RIGHT
 from shared.messages import Motion
 
 DEADMAN_S = 0.3
 """Without another press of a key for so long the robot stops. Keyboards repeat faster."""
 KeyCommand = Literal["", "estop", "quit"]
+W = TypeVar("W")
 MOTIONS: dict[str, Motion] = {
     "w": "forward",
     "s": "back",
@@ -21,6 +24,15 @@ MOTIONS: dict[str, Motion] = {
     "left": "turn-left",
     "right": "turn-right",
 }
+WISHES: dict[str, int | None] = {
+    "w": FORWARD,
+    "a": FORWARD_LEFT,
+    "d": FORWARD_RIGHT,
+    "up": FORWARD,
+    "left": FORWARD_LEFT,
+    "right": FORWARD_RIGHT,
+}
+"""Number of an action by its key."""
 ARROWS = {"A": "up", "B": "down", "C": "right", "D": "left"}
 ESCAPE = "\x1b"
 LONGEST = 16
@@ -61,32 +73,35 @@ class KeyParser:
 
 
 @dataclass
-class Wish:
+class Wish(Generic[W]):
     """What the person at the keys wants now.
 
-    A motion is wanted for `DEADMAN_S` after its key; any other key ends it at once.
+    What a key means is wanted for `DEADMAN_S` after it; any other key ends it at once.
     """
 
+    meaning: Mapping[str, W]
+    nothing: W
+    """What is wanted without a key."""
     command: KeyCommand = ""
     """Last asked for; taken by `take_command`."""
-    _motion: Motion = ""
+    _wanted: W | None = None
     _until_s: float = -math.inf
 
     def press(self, key: str, now_s: float) -> None:
         """A key was pressed, or repeated."""
         key = key.lower()
-        self._motion = MOTIONS.get(key, "")
+        self._wanted = self.meaning.get(key)
         self._until_s = now_s + DEADMAN_S
         if key == "e":
             self.command = "estop"
         elif key == "q" and self.command != "estop":
             self.command = "quit"
 
-    def motion(self, now_s: float) -> Motion:
-        """The motion that is wanted; empty: stand still."""
+    def now(self, now_s: float) -> W:
+        """What is wanted."""
         if now_s >= self._until_s:
-            self._motion = ""
-        return self._motion
+            self._wanted = None
+        return self.nothing if self._wanted is None else self._wanted
 
     def take_command(self) -> KeyCommand:
         """What was asked for since the last call. An emergency stop goes before everything."""

@@ -29,6 +29,9 @@ BAR_WIDTH = 30
 RECENT_S = 60.0
 """A crash longer ago is mentioned, but no longer explained."""
 
+PERSON_SILENT_S = 3.0
+"""A person who took a robot over and says nothing for longer is gone."""
+
 
 @dataclass(frozen=True)
 class RunView:
@@ -75,6 +78,9 @@ def _robot_warnings(view: RunView) -> Iterator[str]:
             yield f"robot {name}: paused, let it go on by `corridor resume`"
         if seen.message.reason:
             yield f"robot {name}: stands still: {seen.message.reason}"
+    for name, told in view.snapshot.actors.items():
+        if told.message.taken_over and told.message.person_silent_s > PERSON_SILENT_S:
+            yield f"robot {name}: stands until it is given back: `corridor takeover`, then q"
 
 
 def _child_warnings(view: RunView) -> Iterator[str]:
@@ -218,4 +224,5 @@ def _robot_row(
     if actor is None:
         return f"robot {name}", state, "no actor yet"
     values = " ".join(f"{value:+.2f}" for value in actor.values)
-    return f"robot {name}", state, f"actor {actor.phase}, step {actor.step}, Q {values}"
+    share = f", {actor.human_actions} of {actor.actions} by persons" if actor.human_actions else ""
+    return f"robot {name}", state, f"actor {actor.phase}, step {actor.step}, Q {values}{share}"

@@ -114,7 +114,7 @@ def _compare(
     if action.action is None:
         found.skipped["robot held still, or moved by hand or on the spot"] += 1
         return
-    if action.weights_version == 0:
+    if action.weights_version == 0 or action.by == "human":
         found.skipped["driven by a network that is not the run's, or by a person"] += 1
         return
     if observation is None:
@@ -125,7 +125,7 @@ def _compare(
         found.skipped["its version of the weights is not in the recording"] += 1
         return
     values = network.all_values(seen_again(image_array(observation.image))[np.newaxis])[0]
-    chosen, greedy = decide(
+    chosen, by = decide(
         config,
         action.robot,
         values,
@@ -133,7 +133,7 @@ def _compare(
         episode=action.fills if action.filling else action.episode,
         step=action.step,
     )
-    if (chosen, greedy) == (action.action, action.greedy):
+    if (chosen, by) == (action.action, action.by):
         found.equal += 1
         found.exact += int(tuple(values.tolist()) == action.values)
         return

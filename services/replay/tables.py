@@ -43,7 +43,7 @@ from shared.rl.memory import PART, SAMPLE, ReplayMemory
 from shared.rl.retention.strategy import columns
 from shared.rl.turn import Commit
 
-SCHEMA = 6
+SCHEMA = 7
 MAP_BYTES = 1 << 38
 """Largest size of the file; only what is used exists."""
 REWARDS = np.dtype([("id", "<u8"), ("reward", "<f4")])

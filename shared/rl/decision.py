@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from shared.facts import Chooser
 from shared.rl.draws import generator
 from shared.rl.policy import Values, choose, choose_uniformly
 
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
 
 def decide(
     config: Config, robot: str, values: Values, *, filling: bool, episode: int, step: int
-) -> tuple[int, bool]:
+) -> tuple[int, Chooser]:
     """Choose an action (A13, A18-A20, E9).
 
     Args:
@@ -25,10 +26,11 @@ def decide(
         step: Steps in its open episode so far.
 
     Returns:
-        The number of the action, and whether the greedy branch chose it.
+        The number of the action, and who chose it: the network by the greedy branch, or chance.
     """
     role = "fill" if filling else "policy"
     draw = generator(config.run.seed, role, robot, episode, step)
     if filling and config.memory.fill == "random":
-        return choose_uniformly(draw), False
-    return choose(values, config.policy, draw)
+        return choose_uniformly(draw), "chance"
+    action, greedy = choose(values, config.policy, draw)
+    return action, "network" if greedy else "chance"

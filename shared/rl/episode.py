@@ -35,6 +35,8 @@ class Step:
     robot_episode: int
     sequence: int
     """The driver's number of the observation."""
+    by: int = 0
+    """Who chose the action: index into `facts.CHOOSERS`."""
 
 
 @dataclass(frozen=True)

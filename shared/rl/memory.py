@@ -31,6 +31,7 @@ SAMPLE = np.dtype(
         ("step", "<u4"),
         ("version", "<u4"),  # weights that chose the action
         ("world", "<u2"),  # index into ReplayMemory.worlds
+        ("by", "u1"),  # who chose the action: index into facts.CHOOSERS
         ("x_m", "<f4"),
         ("y_m", "<f4"),
         ("heading_rad", "<f4"),

@@ -55,7 +55,7 @@ def sample_rows(episode: Episode, worlds: list[str], numbers: Commit) -> tuple[n
     rows["action"], rows["reward"] = values["sample_actions"], values["sample_rewards"]
     rows["commit"], rows["episode"] = numbers.commit, numbers.episode
     rows["robot_episode"], rows["step"] = values["sample_episodes"], values["sample_steps"]
-    rows["version"] = values["sample_versions"]
+    rows["version"], rows["by"] = values["sample_versions"], values["sample_by"]
     rows["world"] = world_indices(worlds, episode.worlds)[values["sample_worlds"]]
     rows["x_m"], rows["y_m"], rows["heading_rad"] = values["positions"].T
     return rows[: numbers.stored], values["images"][: numbers.stored]

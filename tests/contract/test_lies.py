@@ -307,6 +307,7 @@ def episode(liar: Liar, cluster: Cluster, **fields: Any) -> bytes:
         "sample_episodes": bytes(4),
         "sample_versions": bytes(4),
         "sample_worlds": bytes(1),
+        "sample_by": bytes(1),
         "positions": bytes(12),
         "robot_life": place["life"],
         "last_sequence": max(place["sequence"] - 100, 0),

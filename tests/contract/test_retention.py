@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 
 from shared.config import MemoryConfig
-from shared.facts import IMAGE_SHAPE
+from shared.facts import HUMAN, IMAGE_SHAPE
 from shared.rl.memory import SAMPLE, ReplayMemory
 from shared.rl.retention.strategy import Situation, discard
 from shared.rl.retention.table import STRATEGIES
@@ -28,7 +28,7 @@ samples = st.lists(
 
 
 class Memories(RuleBasedStateMachine):
-    """A memory, and a second one that is restarted before every discard."""
+    """A memory, and a twin that is restarted before every discard and that a person filled."""
 
     strategy = "rmm"
 
@@ -81,6 +81,8 @@ class Memories(RuleBasedStateMachine):
         """All columns and numbers are those of the memory that was never restarted."""
         rows, twin = self.memory.rows.copy(), self.twin.rows.copy()
         rows["slot"] = twin["slot"] = 0
+        assert np.all(twin["by"] == HUMAN)
+        twin["by"] = 0  # no strategy treats a person's samples otherwise than others
         assert rows.tobytes() == twin.tobytes()
         assert self.memory.kept == self.twin.kept
         self.memory.check_valid()
@@ -97,6 +99,7 @@ class Memories(RuleBasedStateMachine):
             rows[i]["id"], rows[i]["action"], rows[i]["reward"] = first + i, action, tenths / 10
             rows[i]["world"] = memory.world_indices([world])[0]
             rows[i]["x_m"], rows[i]["episode"] = shows, self.episode
+            rows[i]["by"] = HUMAN if memory is self.twin else 0
             images[i] = np.frombuffer(image_with(front), np.uint8).reshape(IMAGE_SHAPE)
             self.given[first + i] = (action, tenths, world, front)
         memory.append(rows, images)

@@ -1,4 +1,4 @@
-"""`corridor teleop` at a pseudo-terminal: keys move the robot, their absence stops it."""
+"""`corridor teleop` and `takeover` at a pseudo-terminal: keys move the robot, their absence not."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ import pytest
 from cluster import Cluster, make_config
 
 from benchmarks.waiting import wait_until
-from shared.keys import OBSERVATION, ROBOT_STATE
-from shared.messages import Observation, RobotState
+from shared.keys import ACTOR_STATE, OBSERVATION, ROBOT_STATE
+from shared.messages import ActorState, Observation, RobotState
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]
 DEADLINE_S = 200.0
@@ -24,15 +24,15 @@ REALTIME = {"timing": "realtime", "period_s": 0.2, "deadman_s": 0.4}
 
 
 class Terminal:
-    """The keys and the screen of a teleoperation."""
+    """The keys and the screen of a command that drives by keys."""
 
-    def __init__(self, cluster: Cluster, folder: Path) -> None:
+    def __init__(self, cluster: Cluster, folder: Path, command: str = "teleop") -> None:
         self._keys, slave = pty.openpty()
         self._screen = folder / "screen"
         place = ["--endpoint", cluster.config.bus.endpoint, "--run", cluster.config.run.name]
         with self._screen.open("wb") as screen:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "services.cli", "teleop", *place],
+                [sys.executable, "-m", "services.cli", command, *place],
                 stdin=slave,
                 stdout=screen,
                 stderr=screen,
@@ -58,10 +58,10 @@ class Terminal:
 
 
 @contextmanager
-def terminal(cluster: Cluster, folder: Path) -> Iterator[Terminal]:
-    opened = Terminal(cluster, folder)
+def terminal(cluster: Cluster, folder: Path, command: str = "teleop") -> Iterator[Terminal]:
+    opened = Terminal(cluster, folder, command)
     try:
-        wait_until(lambda: "quit" in opened.screen(), DEADLINE_S, "teleop is up")
+        wait_until(lambda: "q: " in opened.screen(), DEADLINE_S, f"{command} is up")
         yield opened
     finally:
         opened.close()
@@ -144,3 +144,42 @@ def test_it_gives_way_to_an_actor_and_ends_with_its_terminal(run_name: str, tmp_
         assert "end it first (corridor stop --service actor)" in refused.screen()
         refused.close()
         cluster.stop("driver", "router")
+
+
+def test_a_person_fills_the_memory_leaves_and_gives_the_robot_back(
+    run_name: str, tmp_path: Path
+) -> None:
+    memory = {"fill": "human", "capacity": 30}
+    config = make_config(run_name, robot={"period_s": 0.05}, memory=memory)
+    with Cluster(config, tmp_path / "run") as cluster:
+        cluster.start("router", "driver", "replay", "learner", "actor")
+        inbox = cluster.bus.inbox()
+        inbox.subscribe(ACTOR_STATE)
+
+        def actor() -> ActorState:
+            def newest() -> list[tuple[str, ActorState]]:
+                inbox.wait(0.1)
+                return inbox.take(ACTOR_STATE, ActorState)
+
+            return wait_until(newest, DEADLINE_S, "a heartbeat of the actor")[0][1]
+
+        cluster.wait(lambda: actor().phase == "person", DEADLINE_S, "the actor waits for a person")
+        with terminal(cluster, tmp_path, "takeover") as person:
+
+            def filled() -> bool:
+                person.press("d")
+                state = actor()
+                return state.human_actions >= 30 and state.robot_episode > 0
+
+            cluster.wait(filled, DEADLINE_S, "keys fill the memory and go on")
+            assert actor().actions == actor().human_actions
+        gone = actor()  # killed: the robot stands
+        assert (gone.taken_over, actor().actions) == (True, actor().actions)
+        with terminal(cluster, tmp_path, "takeover") as person:
+            cluster.wait(lambda: "stands" in person.screen(), DEADLINE_S, "the actor's answer")
+            wait_until(lambda: actor().person != gone.person, DEADLINE_S, "another person")
+            person.press("q")
+            assert person.process.wait(DEADLINE_S) == 0, person.screen()
+        by_network = lambda: actor().actions - actor().human_actions  # noqa: E731
+        cluster.wait(lambda: by_network() > 0, DEADLINE_S, "the network drives")
+        cluster.stop("actor", "learner", "replay", "driver", "router")

@@ -40,7 +40,9 @@ class RobotClock:
         """How often the robot's clock was set."""
         self.apart_s: float | None = None
         """Ours less the robot's; None before the first stamp."""
-        self._at_s, self._set_s = 0.0, -math.inf
+        self.told_s = 0.0
+        """When a message last came whose stamp fits."""
+        self._set_s = -math.inf
 
     def made_s(self, stamp_ns: int, arrived_s: float) -> float:
         """When a message was made, on our clock. Without a stamp (0): when it arrived."""
@@ -48,9 +50,9 @@ class RobotClock:
             return arrived_s
         apart_s = arrived_s - stamp_ns / 1e9
         if self.apart_s is not None:
-            drift_s = DRIFT * max(arrived_s - self._at_s, 0.0)
+            drift_s = DRIFT * max(arrived_s - self.told_s, 0.0)
             apart_s = min(apart_s, self.apart_s + drift_s)
-        self.apart_s, self._at_s = apart_s, arrived_s
+        self.apart_s, self.told_s = apart_s, arrived_s
         return min(stamp_ns / 1e9 + apart_s, arrived_s)
 
     def of_before(self, stamp_ns: int, arrived_s: float) -> bool:
@@ -108,12 +110,17 @@ class Stamps:
         return self._clock.made_s(stamp_ns, arrived_s)
 
     def _in_order(self, stamp_ns: int, arrived_s: float) -> bool:
-        """Whether enough such messages ascend, and no faster than they arrive: no late burst."""
+        """Whether enough such messages ascend, and no faster than they arrive: no late burst.
+
+        Nor may another topic have gone on meanwhile: then the messages are old, and the clock was
+        not set.
+        """
         if self._row and stamp_ns <= self._row[-1][0]:
             self._row = []
         self._row = [*self._row[-SET_ROW:], (stamp_ns, arrived_s)]
         first_ns, first_s = self._row[0]
         enough = len(self._row) >= SET_ROW
+        enough &= self._clock.told_s <= first_s
         return enough and arrived_s - first_s >= 0.5e-9 * (stamp_ns - first_ns)
 
 

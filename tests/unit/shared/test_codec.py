@@ -215,14 +215,14 @@ def test_bytes_are_a_map_with_version_and_type_first(cls: type[m.Message]) -> No
 @pytest.mark.parametrize(
     ("some", "golden"),
     [
-        (m.WeightsRequest(), b"\x82\xa1v\x02\xa1t\xaeWeightsRequest"),
+        (m.WeightsRequest(), b"\x82\xa1v\x03\xa1t\xaeWeightsRequest"),
         (
             m.Refusal(final=True, reason="no"),
-            b"\x84\xa1v\x02\xa1t\xa7Refusal\xa5final\xc3\xa6reason\xa2no",
+            b"\x84\xa1v\x03\xa1t\xa7Refusal\xa5final\xc3\xa6reason\xa2no",
         ),
         (
             m.TurnsRequest(since=300, limit=5),
-            b"\x84\xa1v\x02\xa1t\xacTurnsRequest\xa5since\xcd\x01\x2c\xa5limit\x05",
+            b"\x84\xa1v\x03\xa1t\xacTurnsRequest\xa5since\xcd\x01\x2c\xa5limit\x05",
         ),
         (
             m.Action(
@@ -232,7 +232,7 @@ def test_bytes_are_a_map_with_version_and_type_first(cls: type[m.Message]) -> No
                 sequence=7,
                 attempt=1,
                 action=None,
-                greedy=False,
+                by="network",
                 values=(0.0, -1.0, 0.5),
                 weights_version=3,
                 motion="turn-left",
@@ -241,15 +241,15 @@ def test_bytes_are_a_map_with_version_and_type_first(cls: type[m.Message]) -> No
                 fills=2,
                 step=9,
             ),
-            b"\xde\x00\x10\xa1v\x02\xa1t\xa6Action\xa5robot\xa2r1\xaaactor_life\xac0123456789ab"
+            b"\xde\x00\x10\xa1v\x03\xa1t\xa6Action\xa5robot\xa2r1\xaaactor_life\xac0123456789ab"
             b"\xaarobot_life\xacba9876543210\xa8sequence\x07\xa7attempt\x01\xa6action\xc0"
-            b"\xa6motion\xa9turn-left\xa6greedy\xc2\xa6values\x93\xcb\x00\x00\x00\x00\x00\x00\x00\x00"
+            b"\xa6motion\xa9turn-left\xa2by\xa7network\xa6values\x93\xcb\x00\x00\x00\x00\x00\x00\x00\x00"
             b"\xcb\xbf\xf0\x00\x00\x00\x00\x00\x00\xcb\x3f\xe0\x00\x00\x00\x00\x00\x00"
             b"\xafweights_version\x03\xa7episode\x05\xa7filling\xc3\xa5fills\x02\xa4step\x09",
         ),
         (
             m.Change(number=2, last=True, kind="discard", ids=b"\x09" + bytes(7)),
-            b"\x89\xa1v\x02\xa1t\xa6Change\xa6number\x02\xa4last\xc3\xa4kind\xa7discard"
+            b"\x89\xa1v\x03\xa1t\xa6Change\xa6number\x02\xa4last\xc3\xa4kind\xa7discard"
             b"\xa3ids\xc4\x08\x09\x00\x00\x00\x00\x00\x00\x00\xa6images\xc4\x00"
             b"\xa7actions\xc4\x00\xa7rewards\xc4\x00",
         ),
@@ -294,8 +294,8 @@ def test_one_of_several_types_is_told_by_its_name() -> None:
         b"\xdb\xff\xff\xff\xff",
         b"\xc6\xff\xff\xff\xff",
         b"\xc9\xff\xff\xff\xff\x00",
-        b"\xdf\x7f\xff\xff\xff\xa1v\x02",
-        b"\x82\xa1v\x02\x01\x02",
+        b"\xdf\x7f\xff\xff\xff\xa1v\x03",
+        b"\x82\xa1v\x03\x01\x02",
         b"\x81\xa2\xff\xfe\x01",
         b"\xd6\xff" + b"\xff" * 4,
         b"\xc7\x0c\xff" + b"\xff" * 12,
@@ -314,7 +314,7 @@ def test_bytes_that_are_no_message_are_refused(data: bytes) -> None:
 
 @FAST
 @given(data=st.binary(max_size=300))
-@example(b"\x82\xa1v\x02\xa1t\xc0")
+@example(b"\x82\xa1v\x03\xa1t\xc0")
 def test_random_bytes_are_refused(data: bytes) -> None:
     refused(data, m.Observation)
 
@@ -345,7 +345,7 @@ def test_deep_nesting_is_refused_wherever_it_hides(depth: int, place: str) -> No
 
 
 @pytest.mark.parametrize(
-    "version", [0, 1, 3, -1, None, "2", b"2", True, 2.0, (2,), 2**63, "x" * 4096]
+    "version", [0, 2, 4, -1, None, "3", b"3", True, 3.0, (3,), 2**63, "x" * 4096]
 )
 def test_another_protocol_version_is_refused(version: Any) -> None:
     text = refused({**fields_of(m.WeightsRequest()), "v": version}, m.WeightsRequest)
@@ -442,7 +442,7 @@ def test_wrongly_sized_or_typed_arrays_are_refused(values: list[Any]) -> None:
 # ------------------------------------------------------------------------- episodes and changes
 
 ARRAYS = ["images", "sample_actions", "sample_rewards", "sample_steps", "sample_episodes"]
-ARRAYS += ["sample_versions", "sample_worlds", "positions"]
+ARRAYS += ["sample_versions", "sample_worlds", "sample_by", "positions"]
 
 
 @pytest.mark.parametrize("name", ARRAYS)
@@ -454,7 +454,7 @@ def test_an_episode_whose_arrays_differ_in_length_is_refused(name: str, change: 
 
 
 def test_an_episode_has_1_to_5000_samples() -> None:
-    widths = dict(zip(ARRAYS, (3750, 1, 4, 4, 4, 4, 1, 12), strict=True))
+    widths = dict(zip(ARRAYS, (3750, 1, 4, 4, 4, 4, 1, 1, 12), strict=True))
     fields = fields_of(make_episode(1))
     refused({**fields, **dict.fromkeys(ARRAYS, b"")}, m.Episode)
     refused({**fields, **{name: bytes(5001 * width) for name, width in widths.items()}}, m.Episode)
@@ -467,6 +467,7 @@ def test_an_episode_has_1_to_5000_samples() -> None:
     [
         ("sample_actions", b"\x00\x03"),
         ("sample_worlds", b"\x00\x01"),
+        ("sample_by", b"\x00\x03"),
         ("worlds", []),
         ("worlds", ["a"] * 65),
         ("worlds", ["a/b"]),
@@ -591,7 +592,7 @@ GREEDY = {
     "empty arrays": array(24 * MIB) + b"\x90" * (24 * MIB),
     "numbers": array(5 * MIB) + b"\xce\xff\xff\xff\xff" * (5 * MIB - 1),
     "arrays of arrays": nested(3, 250, b"\x80"),
-    "as a field": b"\x82\xa1v\x02\xa1t" + nested(3, 250, b"\x90"),
+    "as a field": b"\x82\xa1v\x03\xa1t" + nested(3, 250, b"\x90"),
     "arrays announced inside arrays": array(2**31) * 900,
     "a map of many": b"\xdf\x00\x40\x00\x00" + b"\xa1a\x80" * (4 * MIB),
     "long names": b"\x81\xdb" + (20 * MIB).to_bytes(4, "big") + b"\xf0\x9f\x98\x80" * (5 * MIB),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from concurrent.futures import Future
 from pathlib import Path
+from threading import Event
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,7 +17,15 @@ from services.actor.courier import Delivery
 from services.actor.heard import Newest
 from services.actor.service import ActorLoop
 from services.actor.session import Session
-from shared.messages import Action, Episode, EpisodeAck, LearnerState, RobotProgress, image_array
+from shared.messages import (
+    Action,
+    Episode,
+    EpisodeAck,
+    LearnerState,
+    RobotProgress,
+    Takeover,
+    image_array,
+)
 
 LEARNER = LearnerState(
     id="main",
@@ -50,12 +59,14 @@ def progress(episodes: int) -> RobotProgress:
 class Rig:
     """A session whose episodes are delivered when a test says so."""
 
-    def __init__(self, timing: str, folder: Path) -> None:
+    def __init__(self, timing: str, folder: Path, **given: Any) -> None:
         self.published: list[Action] = []
         self.sent: list[Episode] = []
         self.on_its_way: Future[Delivery] = Future()
         me = SimpleNamespace(
-            config=make_config(robot={"timing": timing}),
+            ident="main",
+            stop=Event(),
+            config=make_config(robot={"timing": timing}, **given),
             log=logging.getLogger("actor"),
             bus=SimpleNamespace(publish=lambda _, action, __: self.published.append(action)),
         )
@@ -67,7 +78,7 @@ class Rig:
         courier = SimpleNamespace(send=self._send, ask=lambda _: asked)
         newest = Newest(LEARNER)
         path = folder / "robot1.msgpack"
-        given: tuple[Any, ...] = (
+        parts: tuple[Any, ...] = (
             me,
             "robot1",
             "c" * 12,
@@ -78,7 +89,7 @@ class Rig:
             courier,
             set,
         )
-        self.session = Session(*given)
+        self.session = Session(*parts)
 
     def _send(self, episode: Episode) -> Future[Delivery]:
         self.sent.append(episode)
@@ -166,3 +177,81 @@ def test_a_robot_that_owes_an_episode_is_not_put_away(tmp_path: Path) -> None:
     assert rig.session.idle_s >= 60.0
     rig.session._pending = SimpleNamespace()  # type: ignore[assignment]
     assert rig.session.idle_s == 0.0
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    now = SimpleNamespace(s=100.0)
+    monkeypatch.setattr("services.actor.session.time.monotonic", lambda: now.s)
+    return now
+
+
+def takeover(rig: Rig, number: int, action: int | None, now_s: float, **given: Any) -> None:
+    wish = Takeover(robot="robot1", life="9" * 12, number=number, action=action, **given)
+    rig.session.hand.note(wish, now_s)
+
+
+def driven(rig: Rig) -> list[tuple[int | None, str]]:
+    return [(action.action, action.by) for action in rig.published]
+
+
+def test_in_lockstep_a_person_drives_no_faster_than_real_time(
+    clock: SimpleNamespace, tmp_path: Path
+) -> None:
+    rig = Rig("lockstep", tmp_path)
+    takeover(rig, 1, None, clock.s)
+    rig.see(0)
+    assert rig.published == []
+    takeover(rig, 2, 2, clock.s)
+    rig.see(0)
+    rig.see(1)
+    assert driven(rig) == [(2, "human")]
+    clock.s += 0.25
+    takeover(rig, 3, 1, clock.s)
+    rig.see(1)
+    assert driven(rig) == [(2, "human"), (1, "human")]
+    clock.s += 0.4  # they let go, or are gone
+    rig.see(2)
+    assert len(rig.published) == 2
+    assert rig.session.heartbeat(0, 0).phase == "person"
+    takeover(rig, 4, None, clock.s, give_back=True)
+    rig.see(2)
+    assert rig.published[-1].by != "human"
+    assert rig.session.heartbeat(0, 0).human_actions == 2
+
+
+def test_in_real_time_letting_go_stops_at_once_and_a_key_starts_within_the_period(
+    clock: SimpleNamespace, tmp_path: Path
+) -> None:
+    rig = Rig("realtime", tmp_path)
+    rig.see(0)
+    takeover(rig, 1, None, clock.s)
+    rig.see(1)
+    assert driven(rig)[1:] == [(None, "network")]  # it moved: hold
+    rig.see(1, attempt=1)
+    assert len(rig.published) == 2  # it stands: there is time
+    clock.s += 0.1
+    takeover(rig, 2, 1, clock.s)
+    rig.see(1, attempt=1)
+    assert driven(rig)[2:] == [(1, "human")]
+    clock.s += 0.4
+    rig.see(2)
+    rig.see(2, attempt=1)
+    clock.s += 0.2
+    rig.see(2, attempt=1)
+    assert driven(rig)[3:] == [(None, "network"), (None, "network")]
+
+
+def test_a_memory_that_a_person_is_to_fill_waits_for_one(
+    clock: SimpleNamespace, tmp_path: Path
+) -> None:
+    rig = Rig("lockstep", tmp_path, memory={"fill": "human"})
+    rig.session.actor.progress = progress(0).model_copy(update={"filling": True})
+    rig.see(0)
+    assert rig.published == []
+    takeover(rig, 1, 0, clock.s)
+    rig.see(0)
+    assert [(a.action, a.by, a.filling) for a in rig.published] == [(0, "human", True)]
+    takeover(rig, 2, None, clock.s, give_back=True)
+    rig.see(1)
+    assert len(rig.published) == 1

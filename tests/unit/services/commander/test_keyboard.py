@@ -42,24 +42,24 @@ def test_it_does_not_matter_how_bytes_are_cut(data: bytes, cut: int) -> None:
 def test_a_motion_is_wanted_only_shortly_after_its_key(
     presses: list[tuple[str, float]], later_s: float
 ) -> None:
-    wish, now_s, last = Wish(), 100.0, ("", -1.0)
+    wish, now_s, last = Wish(MOTIONS, ""), 100.0, ("", -1.0)
     for key, gap_s in presses:
         now_s += gap_s
         wish.press(key, now_s)
         last = (key, now_s)
     now_s += later_s
-    wanted = wish.motion(now_s)
+    wanted = wish.now(now_s)
     if now_s - last[1] >= DEADMAN_S or last[0].lower() not in MOTIONS:
         assert wanted == ""
     else:
         assert wanted == MOTIONS[last[0].lower()]
-    assert wish.motion(now_s + DEADMAN_S) == ""
+    assert wish.now(now_s + DEADMAN_S) == ""
 
 
 @FAST
 @given(st.lists(KEYS, max_size=20))
 def test_an_emergency_stop_is_never_forgotten(keys: list[str]) -> None:
-    wish = Wish()
+    wish = Wish(MOTIONS, "")
     for i, key in enumerate(keys):
         wish.press(key, float(i))
     expected = "estop" if "e" in keys else "quit" if "q" in keys else ""

@@ -59,7 +59,7 @@ def chosen(observation: Observation, version: int, step: int, **fields: Any) -> 
     values = network.all_values(image_array(observation.image)[np.newaxis])[0]
     filling = version == 1
     episode = fields.get("fills" if filling else "episode", 0)
-    action, greedy = decide(
+    action, by = decide(
         CONFIG, observation.robot, values, filling=filling, episode=episode, step=step
     )
     return Action(
@@ -69,7 +69,7 @@ def chosen(observation: Observation, version: int, step: int, **fields: Any) -> 
         sequence=observation.sequence,
         attempt=observation.attempt,
         action=action,
-        greedy=greedy,
+        by=by,
         values=tuple(values.tolist()),
         weights_version=version,
         filling=filling,
@@ -272,7 +272,7 @@ def test_a_recording_played_back_gives_the_recorded_actions(
     assert "24 of 24 actions equal, 24 of them to the last bit" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("change", ["action", "seed", "greedy"])
+@pytest.mark.parametrize("change", ["action", "seed", "by"])
 def test_a_difference_is_told_and_makes_the_exit_code_1(
     tmp_path: Path, turns: Any, change: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -280,7 +280,7 @@ def test_a_difference_is_told_and_makes_the_exit_code_1(
     fields: dict[str, Any] = {
         "action": {"action": (action.action + 1) % 3},
         "seed": {"step": action.step + 1, "episode": 11},
-        "greedy": {"greedy": not action.greedy},
+        "by": {"by": "chance" if action.by == "network" else "network"},
     }[change]
     other = action.model_copy(update=fields)
     path = write(tmp_path / "f.mcap", [*turns[:20], (observation, other), *turns[21:]])

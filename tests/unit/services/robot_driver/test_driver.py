@@ -84,7 +84,7 @@ def answer(sequence: int, attempt: int = 0, life: str = LIFE) -> Action:
         sequence=sequence,
         attempt=attempt,
         action=0,
-        greedy=True,
+        by="network",
         values=(0.0, 0.0, 0.0),
         weights_version=1,
     )

@@ -145,7 +145,7 @@ class Stand:
                 attempt=seen.attempt,
                 action=action,
                 motion=motion,
-                greedy=True,
+                by="network",
                 values=(0.0, 0.0, 0.0),
                 weights_version=1,
             )

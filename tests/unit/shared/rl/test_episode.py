@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from services.actor.actor import Actor
 from shared.config import EpisodeConfig
+from shared.facts import CHOOSERS
 from shared.messages import Action, Episode, Observation, RobotProgress
 from shared.rl.draws import generator
 from shared.rl.episode import OpenEpisode, Step
@@ -286,9 +287,46 @@ def test_actions_are_drawn_by_robot_episode_and_step() -> None:
             episode, step = 2 + (sequence - 17) // 8, 4 + (sequence - 17) % 8
         draw = generator(CONFIG.run.seed, "policy", "robot1", episode, step)
         values = np.array(fake_values(observe(sequence).image, 1), np.float32)
-        assert (action.action, action.greedy) == choose(values, CONFIG.policy, draw)
+        assert (action.action, action.by == "network") == choose(values, CONFIG.policy, draw)
         assert action.values == tuple(float(v) for v in values)
         assert (action.sequence, action.robot_life, action.attempt) == (sequence, LIFE, 0)
+
+
+def driven_by_a_person(keep: bool, wishes: tuple[int | None, ...]) -> tuple[Actor, Episode | None]:
+    """An actor after these wishes and a bump, and what it would store."""
+    config = make_config(robot={"id": "robot1"}, memory={"keep_human": keep})
+    actor = Actor(config, "robot1", LIFE, FakePredictor())  # type: ignore[arg-type]
+    actor.begin(progress(), observe(0))
+    for sequence, wish in enumerate(wishes):
+        assert finish(actor, observe(sequence)) is None
+        action = actor.act(observe(sequence), wish=wish)
+        assert wish is None or (action.action, action.by) == (wish, "human")
+    return actor, finish(actor, observe(len(wishes), bump=True))
+
+
+@pytest.mark.parametrize(("keep", "stored"), [(True, [0, 1, 2, 3]), (False, [0, 3])])
+def test_what_a_person_chose_is_a_sample_that_says_so(keep: bool, stored: list[int]) -> None:
+    wishes = (None, 2, 1, None)
+    (actor, episode), (_, every) = (driven_by_a_person(k, wishes) for k in (keep, True))
+    assert episode is not None
+    assert every is not None
+    assert list(np.frombuffer(episode.sample_steps, "<u4")) == stored
+    human = [CHOOSERS[i] == "human" for i in episode.sample_by]
+    assert human == [i in (1, 2) for i in stored]
+    assert (actor.human_actions, episode.actions) == (2, 4)
+    assert episode.dropped_samples == 4 - len(stored)
+    rewards = [np.frombuffer(each.sample_rewards, "<f4") for each in (every, episode)]
+    assert rewards[0][stored].tolist() == rewards[1].tolist()  # they look ahead over all steps
+
+
+def test_an_episode_of_a_person_alone_may_be_left_out() -> None:
+    actor, episode = driven_by_a_person(False, (1,))
+    assert episode is None
+    assert (actor.dropped_samples, actor.dropped_episodes, actor.at_boundary) == (1, 1, True)
+    actor.act(observe(1))
+    episode = finish(actor, observe(2, bump=True))
+    assert episode is not None
+    assert (episode.actions, episode.dropped_samples, episode.dropped_episodes) == (2, 1, 1)
 
 
 def test_filling_acts_uniformly_at_random_and_marks_its_submissions() -> None:
@@ -299,7 +337,7 @@ def test_filling_acts_uniformly_at_random_and_marks_its_submissions() -> None:
     for sequence in range(300):
         actions.append(actor.act(observe(sequence)))
     assert min(np.bincount([a.action for a in actions], minlength=3)) > 60
-    assert not any(a.greedy for a in actions)
+    assert {a.by for a in actions} == {"chance"}
     episode = finish(actor, observe(300, bump=True))
     assert episode is not None
     assert episode.fill

@@ -122,6 +122,19 @@ def test_a_burst_of_late_messages_is_no_clock_that_was_set_back() -> None:
     assert not judge.copied
 
 
+def test_old_messages_beside_a_topic_that_goes_on_do_not_set_the_clock() -> None:
+    clock = RobotClock()
+    odometry, camera = Stamps(clock), Stamps(clock)
+    for tick in range(100):
+        now_s = tick * PERIOD_S
+        assert odometry.made_s(stamp_ns(ROBOT_S + now_s - WAY_S), now_s) is not None
+        if tick % 2:
+            late_s = 30.0 if tick > 20 else 0.0
+            made_s = camera.made_s(stamp_ns(ROBOT_S + now_s - WAY_S - late_s), now_s)
+            assert (made_s is None) == (tick > 20)
+    assert clock.settings == 0
+
+
 def test_what_is_still_of_the_time_before_a_clock_was_set_back_is_not_new() -> None:
     clock = RobotClock()
     odometry, camera = judge_of(clock), judge_of(clock)
