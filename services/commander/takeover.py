@@ -37,10 +37,11 @@ HELP = (
 class Person:
     """Says what a person wants of one robot. One thread."""
 
-    def __init__(self, bus: Bus, robot: str) -> None:
-        self._bus, self._robot = bus, robot
-        self.life = new_life()
-        self._number = 0
+    def __init__(self, bus: Bus, robot: str, before: Person | None = None) -> None:
+        """before: the same person on another connection."""
+        self.bus, self._robot = bus, robot
+        self.life: str = before.life if before else new_life()
+        self._number: int = before._number if before else 0
 
     def say(self, action: int | None, *, give_back: bool = False) -> None:
         """Wish for an action, or None: to stand. Say it again within `WISH_PERIOD_S`."""
@@ -52,7 +53,7 @@ class Person:
             action=action,
             give_back=give_back,
         )
-        self._bus.publish(TAKEOVER, message, self._robot)
+        self.bus.publish(TAKEOVER, message, self._robot)
 
 
 def run(config: Config, robot: str | None, echo: Callable[[str], None]) -> int:

@@ -10,13 +10,14 @@ from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from services.commander.takeover import Person
 from services.page.watch import Watch
 from shared.bus import Bus
 from shared.errors import CorridorError
 from shared.halts.book import ALL
 from shared.halts.orders import RobotOrder, order
 from shared.keys import ROBOT_WORLD
-from shared.messages import Ident, WorldChange, WorldChanged
+from shared.messages import ActionNumber, Ident, WorldChange, WorldChanged
 from shared.service import new_life
 
 MOST_BYTES = 4096
@@ -28,6 +29,15 @@ TOLD, LINES = 12, 12
 HALTS: tuple[RobotOrder, ...] = ("estop", "pause")
 AT_ONCE = {True: 32, False: 8}
 """Halts, and other commands, that may be under way."""
+
+
+class Wish(BaseModel):
+    """What a person who drives wants now (`Takeover`)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    action: ActionNumber | None = None
+    give_back: bool = False
 
 
 class Command(BaseModel):
@@ -43,11 +53,14 @@ class Command(BaseModel):
     order: RobotOrder | None = None
     change: WorldChange | None = None
     note: Annotated[str, Field(min_length=1, max_length=200)] | None = None
+    wish: Wish | None = None
+    """For one robot."""
 
     @model_validator(mode="after")
     def _one_thing(self) -> Self:
-        if sum(each is not None for each in (self.seen, self.order, self.change, self.note)) != 1:
-            raise ValueError("expected one of seen, order, change, note")
+        things = (self.seen, self.order, self.change, self.note, self.wish)
+        if sum(each is not None for each in things) != 1 or (self.wish and not self.robot):
+            raise ValueError("expected one of seen, order, change, note, and wish with a robot")
         return self
 
     @property
@@ -89,6 +102,14 @@ class Desk:
         """What became of the newest commands, newest last."""
         with self._lock:
             return [asdict(each) for each in self._told]
+
+    def drive(self, robot: str, wish: Wish, people: dict[str, Person]) -> None:
+        """Pass on what the person at one browser wants, who is another person for each robot."""
+        if bus := self._watch.bus:
+            person = people.get(robot)
+            if person is None or person.bus is not bus:
+                person = people[robot] = Person(bus, robot, person)
+            person.say(wish.action, give_back=wish.give_back)
 
     def take(self, command: Command) -> threading.Thread:
         """Begin to carry out a command. Raises CorridorError when too many are under way."""

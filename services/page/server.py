@@ -24,6 +24,7 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
+from services.commander.takeover import Person
 from services.page.address import Address, Guard
 from services.page.browse import Answer, Browser
 from services.page.commands import MOST_BYTES, Command, Desk
@@ -47,6 +48,7 @@ class Link:
         self._watch, self._desk, self._token, self._socket = watch, desk, token, socket_
         self._known: dict[str, str] = {}
         self._number, self._painted = 0, asyncio.Event()
+        self._people: dict[str, Person] = {}
 
     def update(self) -> str:
         """The sections that the browser does not know as they are; it knows them then."""
@@ -90,7 +92,10 @@ class Link:
         if not secrets.compare_digest(command.token.encode(), self._token.encode()):
             return "this address has no valid token: it shows the run, but commands nothing"
         try:
-            self._desk.take(command)
+            if command.wish and command.robot:
+                self._desk.drive(command.robot, command.wish, self._people)
+            else:
+                self._desk.take(command)
         except CorridorError as error:
             return str(error)
         return ""

@@ -71,5 +71,5 @@ class Track:
             told |= {"image": b64encode(seen.image).decode(), "world": seen.world}
             told["pose"] = [seen.x_m, seen.y_m, seen.heading_rad]
         if self.chosen:
-            told |= self.chosen.model_dump(include={"values", "action", "greedy", "episode"})
+            told |= self.chosen.model_dump(include={"values", "action", "by", "episode"})
         return told

@@ -252,6 +252,25 @@ def test_a_stop_is_heard_soon_after_the_click(seen: Watched, run: Run) -> None:
     assert p95 <= STOP_BAR_MS
 
 
+def test_a_person_drives_a_robot_and_gives_it_back(seen: Watched) -> None:
+    page, wheel = seen.page, seen.page.locator("#wheel-robotino1")
+    wheel.locator("summary").click()
+    wheel.get_by_role("button", name="Take over").click()
+    status = wheel.get_by_role("status")
+    expect(status).to_contain_text("A person drives it")
+    page.keyboard.down("a")
+    expect(status).to_contain_text("actions by persons")
+    expect(page.locator("#robot-robotino1 .chosen")).to_contain_text("by a person")
+    page.keyboard.up("a")
+    wheel.get_by_role("button", name="Hold to drive robotino1 forward").hover()
+    page.mouse.down()
+    expect(page.locator("#robot-robotino1 .chosen")).to_contain_text("forward")
+    page.mouse.up()
+    wheel.get_by_role("button", name="Give back").click()
+    expect(status).not_to_contain_text("A person drives it")
+    expect(page.locator("#robot-robotino1 .chosen")).not_to_contain_text("by a person")
+
+
 @pytest.mark.parametrize("killed", ["page", "router"])
 def test_it_says_what_is_gone_and_comes_back(killed: str, seen: Watched, run: Run) -> None:
     page, before = seen.page, run.pid(killed)

@@ -1,6 +1,7 @@
 // The run: one WebSocket brings sections of what changed; each update is painted and acknowledged.
 import { $, ACTIONS, curve, el, grey, list, map, short, text } from "./draw.js";
 import { openMemory } from "./memory.js";
+import { paintWheel, wheel } from "./wheel.js";
 
 const SILENT_MS = 3000, token = location.hash.slice(1), known = {};
 let socket, backoff_ms = 500, heard_ms = 0, toMetres = null, chosen = "";
@@ -84,7 +85,7 @@ function card(name) { // .takeover has room for what lets a person drive this ro
     el("div", { class: "bars" }, ...ACTIONS.flatMap(() => [el("span"), el("div", { class: "bar" }, el("i")), el("span")])),
     el("p", { class: "hint" }), el("p", { class: "buttons" }, ...["Stop", "Clear", "Pause", "Resume"].map((word) => el("button", {
       type: "button", "data-robot": name, "data-order": { Stop: "estop" }[word] ?? word.toLowerCase(), "aria-label": `${word} ${name}` }, word))),
-    el("div", { class: "takeover", "data-robot": name }));
+    wheel(name, send));
 }
 
 function paintRobots({ services }) {
@@ -97,10 +98,11 @@ function paintRobots({ services }) {
     ACTIONS.forEach((action, n) => {
       const [label, bar, number] = [...bars.children].slice(3 * n), value = seen.values?.[n] ?? 0;
       label.className = seen.action === n ? "chosen" : "";
-      text(label, action + (seen.action === n ? (seen.greedy ? " ◂" : " ◂ by chance") : ""));
+      text(label, action + (seen.action === n ? ({ network: " ◂", chance: " ◂ by chance", human: " ◂ by a person" }[seen.by]) : ""));
       text(number, seen.values ? value.toFixed(2) : "–");
       Object.assign(bar.firstChild.style, { left: `${50 + 50 * Math.min(0, value)}%`, width: `${50 * Math.abs(value)}%` });
     });
+    paintWheel(name, actor);
     const [middle, high] = seen.latency_ms ?? [];
     text(words, [`${robot.state ?? "unknown"} in ${robot.world ?? seen.world}`,
       `bumps ${robot.bumps ?? "–"}, laps ${robot.laps_left ?? "–"} left ${robot.laps_right ?? "–"} right`,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -23,7 +24,7 @@ from services.page.server import Server
 from services.page.track import Track
 from services.page.watch import Watch
 from shared.errors import CorridorError
-from shared.messages import LearnerState, ReplayState, RobotState, Told
+from shared.messages import LearnerState, ReplayState, RobotState, Takeover, Told
 
 TOKEN = "the-token"  # noqa: S105
 HEADERS = {"host": "127.0.0.1:8000"}
@@ -127,6 +128,33 @@ def test_commands_with_the_token_are_taken(client: TestClient, desk: Taken) -> N
         socket.send_text('{"seen": 1}')
         update(socket)
     assert [command.what for command in desk.commands] == ["emergency stop", "place box1", "note"]
+
+
+def test_what_a_person_who_drives_wants_is_said_to_the_actor(
+    client: TestClient, watch: Watch, desk: Taken
+) -> None:
+    said: list[Takeover] = []
+    bus: Any = SimpleNamespace(publish=lambda _, wish, __: said.append(wish))
+    drive = {"token": TOKEN, "robot": "r1"}
+    with client.websocket_connect("/updates") as socket:
+        update(socket)
+        socket.send_json({**drive, "wish": {"action": 0}})  # no router: it is said to nobody
+        socket.send_json({**drive, "wish": {"action": 3}})
+        assert "wish.action" in socket.receive_json()["refused"]
+        watch.bus = bus
+        for wish in ({"action": 2}, {}, {"give_back": True}):
+            socket.send_json({**drive, "wish": wish})
+        socket.send_json({"robot": "r1", "wish": {"action": 1}})
+        assert "token" in socket.receive_json()["refused"]
+        socket.send_json({"token": TOKEN, "wish": {"action": 1}})
+        assert "wish with a robot" in socket.receive_json()["refused"]
+    assert [(w.robot, w.number, w.action, w.give_back) for w in said] == [
+        ("r1", 1, 2, False),
+        ("r1", 2, None, False),
+        ("r1", 3, None, True),
+    ]
+    assert len({w.life for w in said}) == 1
+    assert desk.commands == []
 
 
 def test_too_many_browsers_are_turned_away(

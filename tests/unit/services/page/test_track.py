@@ -14,7 +14,7 @@ from shared.messages import Action
 def make_action(sequence: int, **given: Any) -> Action:
     plain: dict[str, Any] = {
         "robot": "robot1", "actor_life": OTHER_LIFE, "robot_life": LIFE, "sequence": sequence,
-        "action": 1, "greedy": True, "values": (0.1, 0.4, -0.2), "weights_version": 3,
+        "action": 1, "by": "network", "values": (0.1, 0.4, -0.2), "weights_version": 3,
     }  # fmt: skip
     return Action(**{**plain, **given})
 
