@@ -19,19 +19,12 @@ import numpy.typing as npt
 from services.robot_driver.atlas.action_geometry import CONTACT_M, ActionGeometry, Floats
 from services.robot_driver.atlas.pose_grid import PoseGrid, Table
 from services.robot_driver.simulated.world import World
-from services.robot_driver.simulated.world_parts import Route
 from shared.facts import ACTION_COUNT
 
 Ints = npt.NDArray[np.int64]
 
 _DISCOUNT = 0.99
 _SWEEPS = 250
-_ARRIVAL_M = 1.0
-"""The last part of a route, where a tour has arrived."""
-_CORNER_M = 2.5
-"""Corners of a route may be cut; who gets farther ahead at once has left out a part of it."""
-_ARRIVAL_GAIN = 100.0
-"""Gain of each action there: more than turning back before a dead end is worth."""
 _LOST = -100.0
 """Value of a run that cannot go on."""
 
@@ -49,10 +42,7 @@ class PlannedRuns:
 
 
 Gain = Callable[[Floats, Floats], Floats]
-"""Progress between poses before and after an action: two float64 [n, 3] to float64 [n].
-
-Minus infinity where the action is not wanted at all.
-"""
+"""Progress between poses before and after an action: two float64 [n, 3] to float64 [n]."""
 
 
 @dataclass(frozen=True)
@@ -118,46 +108,10 @@ class Planner:
         def turned(before: Floats, after: Floats) -> Floats:
             return direction * _wrap(self._bearing(after) - self._bearing(before))
 
-        return self._pursue(pose, actions, (direction, keep_m), turned)
-
-    def tour(self, actions: int, keep_m: float = 0.005) -> PlannedRuns:
-        """The planned run along the world's route, from its first point towards its second.
-
-        Args:
-            actions: Length of the run, at most; it may go on beyond the end of the route.
-            keep_m: Room to keep to all walls.
-
-        Raises:
-            ValueError: The world has no route.
-        """
-        route = self._route
-        (x, y), (ahead_x, ahead_y) = route.points[:2]
-        pose = np.array([x, y, math.atan2(ahead_y - y, ahead_x - x)])
-
-        def advanced(before: Floats, after: Floats) -> Floats:
-            along = self.progress(after)
-            gain, arrived = along - self.progress(before), along > route.length_m - _ARRIVAL_M
-            follows = np.abs(gain) <= _CORNER_M
-            return np.where(follows, gain + _ARRIVAL_GAIN * arrived, -np.inf)
-
-        return self._pursue(pose, actions, (0, keep_m), advanced)
-
-    def progress(self, poses: Floats) -> Floats:
-        """How far along the world's route poses float64 [n, 3] are, metres, float64 [n].
-
-        It is the way from the first point to the place closest to each pose.
-
-        Raises:
-            ValueError: The world has no route.
-        """
-        points = np.array(self._route.points, np.float64)
-        start, legs = points[:-1], np.diff(points, axis=0)
-        lengths = np.hypot(*legs.T)
-        offset = poses[:, None, :2] - start
-        part = np.clip(np.einsum("nlj,lj->nl", offset, legs) / lengths**2, 0.0, 1.0)
-        leg = np.hypot(*(offset - part[..., None] * legs).transpose(2, 0, 1)).argmin(axis=1)
-        before = np.concatenate([[0.0], np.cumsum(lengths)])
-        return np.asarray(before[leg] + part[np.arange(len(poses)), leg] * lengths[leg])
+        key = (direction, keep_m)
+        if key not in self._aims:
+            self._aims[key] = _Aim(turned, keep_m, self._gain_table(turned, keep_m))
+        return self._roll_out(pose[None, :], actions, self._aims[key])
 
     def winding(self, poses: Floats) -> Floats:
         """Net angle round the lap centre along float64 [steps, 3], radians, float64 [steps].
@@ -167,15 +121,6 @@ class Planner:
         """
         angle = np.unwrap(self._bearing(poses))
         return np.asarray(angle - angle[0])
-
-    def _pursue(
-        self, pose: Floats, actions: int, key: tuple[int, float], gain: Gain
-    ) -> PlannedRuns:
-        """A run for gain; the key is its direction, 0 along the route, and the room to keep."""
-        if key not in self._aims:
-            keep_m = key[1]
-            self._aims[key] = _Aim(gain, keep_m, self._gain_table(gain, keep_m))
-        return self._roll_out(pose[None, :], actions, self._aims[key])
 
     def _roll_out(self, poses: Floats, actions: int, aim: _Aim | None) -> PlannedRuns:
         poses = poses.copy()
@@ -246,12 +191,6 @@ class Planner:
             ]
             table = np.maximum(np.maximum.reduce(best), np.float32(_LOST))
         return table
-
-    @property
-    def _route(self) -> Route:
-        if self.world.route is None:
-            raise ValueError(f"world {self.world.name!r} has no route")
-        return self.world.route
 
     def _bearing(self, poses: Floats) -> Floats:
         if self.world.lap is None:

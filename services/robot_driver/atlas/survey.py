@@ -29,7 +29,6 @@ COMFORTABLE_M = 0.4
 """Room to all walls on the lap that stands for an ordinary driving line."""
 _RECOVERIES = 1000
 _RACE_ACTIONS = 600
-_TOUR_HORIZON = 6
 _SPACING_M = 0.1
 """Distance of the places at which the width is measured."""
 
@@ -73,7 +72,6 @@ def survey(config: Config, world: World) -> Figures:
         **_geometry(world, geometry),
         **_best_run(planner),
         **_laps(planner),
-        **_tour(world, geometry),
         **_random_figures(driven),
         **_saved(planner, driven),
     }
@@ -167,22 +165,6 @@ def _actions_per_lap(
     angle = float(planner.winding(run.poses[: survived + 1, 0])[-1])
     laps = direction * angle / (2.0 * math.pi)
     return survived / laps if laps > 0.5 else math.inf
-
-
-def _tour(world: World, geometry: ActionGeometry) -> Figures:
-    """How much of the route a planned run drives, and in how many actions."""
-    if world.route is None:
-        return {}
-    # A dead end may end the route, so the run need not be able to go on for ever.
-    planner = Planner(world, geometry, horizon=_TOUR_HORIZON)
-    length = world.route.length_m
-    run = planner.tour(round(2.0 * length / geometry.step_m))
-    driven = planner.progress(run.poses[: int(run.survived[0]) + 1, 0])
-    return {
-        "route_m": length,
-        "route_driven_m": float(driven.max()),
-        "route_driven_actions": int(driven.argmax()),
-    }
 
 
 def _centre_line_lap(world: World) -> float:
