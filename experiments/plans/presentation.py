@@ -93,8 +93,6 @@ class Presentation(Section):
     """Groups in which all others are compared with this experiment only."""
     table: Literal["", "fitness"] = ""
     """The table that this experiment has a row in."""
-    full_scale: bool = True
-    """Whether the plan is meant for the full scale, and its cost there is told."""
     figures: dict[str, str] = Field(default_factory=dict)
     """The figure of the thesis by the kind of ours: fitness, loss, memory, worlds, route, table,
     `probes-best-<world>`, `probes-last-<world>`."""
@@ -102,5 +100,5 @@ class Presentation(Section):
     claims: Annotated[tuple[Claim, ...], Field(strict=False)] = ()
 
 
-INHERITED = ("groups", "table", "full_scale")
+INHERITED = ("groups", "table")
 """What a plan takes over from the one that it is `like`; the rest tells of one experiment only."""

@@ -20,15 +20,12 @@ from experiments.report.run_folder import Experiment
 from experiments.report.sections import section_of
 
 
-def write_report(
-    folders: Sequence[Path], out: Path, gpu_step_ms: float | None = None
-) -> list[Path]:
+def write_report(folders: Sequence[Path], out: Path) -> list[Path]:
     """Read runs and write the whole report.
 
     Args:
         folders: Folders of seeds, of experiments, or of several experiments.
         out: Where the pages are written; the folder is made if it is missing.
-        gpu_step_ms: Measured time of a gradient step on a GPU; adds projected hours.
 
     Returns:
         The pages written, HTML first.
@@ -37,7 +34,7 @@ def write_report(
         ConfigError: A folder holds no run.
         StateError: A file of a run is damaged.
     """
-    sections = all_sections(run_folder.load(folders), gpu_step_ms)
+    sections = all_sections(run_folder.load(folders))
     write_pictures(sections, out / "figures")
     page = out / "report.html"
     page.write_text(html("Results", sections), encoding="utf-8")
@@ -49,19 +46,16 @@ def write_report(
     return written
 
 
-def all_sections(
-    experiments: Sequence[Experiment], gpu_step_ms: float | None = None, plans: Traversable = PLANS
-) -> list[Section]:
+def all_sections(experiments: Sequence[Experiment], plans: Traversable = PLANS) -> list[Section]:
     """The overview, the thesis's claims, comparisons, every experiment; nothing is drawn yet.
 
     Args:
         experiments: What was run.
-        gpu_step_ms: As for `write_report`.
         plans: The folder of plans, which tell how experiments are shown.
     """
     shown = presentations({experiment.name for experiment in experiments}, plans)
     return [
-        overview(experiments, gpu_step_ms, plans),
+        overview(experiments),
         *claims_sections(experiments, shown),
         *compare_all(experiments, shown),
         *(section_of(experiment, shown[experiment.name]) for experiment in experiments),

@@ -85,14 +85,10 @@ def report(
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the pages.")] = Path("report"),
-    gpu_step_ms: Annotated[
-        float | None,
-        typer.Option(help="Measured time of a GPU's gradient step; adds projected hours.", min=0),
-    ] = None,
 ) -> None:
     """Write figures, tables and findings of finished runs as HTML and Markdown."""
     full_report = import_installed("experiments.report.full_report", "experiments")
-    pages = full_report.write_report(runs, out, gpu_step_ms)
+    pages = full_report.write_report(runs, out)
     typer.echo(f"written: {pages[0]} and {len(pages) - 1} Markdown pages beside it")
 
 
