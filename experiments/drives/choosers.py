@@ -58,17 +58,6 @@ def greedy(network: Predicts) -> Chooser:
     return chosen
 
 
-def each(choose_one: Callable[[Observation, np.random.Generator], int]) -> Chooser:
-    """Ask for one robot after the other."""
-
-    def chosen(
-        observations: Sequence[Observation], draws: Sequence[np.random.Generator]
-    ) -> list[int]:
-        return [choose_one(seen, draw) for seen, draw in zip(observations, draws, strict=True)]
-
-    return chosen
-
-
 def uniform(
     observations: Sequence[Observation],  # noqa: ARG001
     draws: Sequence[np.random.Generator],
