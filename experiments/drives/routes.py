@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,8 +33,7 @@ _BUMP, _START, _END = "#d55e00", "#009e73", "#282c34"
 _WAY = "#0072b2"
 
 
-@dataclass(frozen=True)
-class Event:
+class Event(NamedTuple):
     """Something worth telling that happened on a drive."""
 
     number: int
@@ -43,8 +42,7 @@ class Event:
     text: str
 
 
-@dataclass(frozen=True)
-class Route:
+class Route(NamedTuple):
     """One drive with its events."""
 
     trace: Trace
@@ -62,7 +60,7 @@ def write(path: Path, route: Route) -> None:
         headings_rad=trace.headings_rad,
         way_m=trace.way_m,
         laps=np.array([trace.laps_left, trace.laps_right]),
-        events=np.array(json.dumps([event.__dict__ for event in route.events])),
+        events=np.array(json.dumps([event._asdict() for event in route.events])),
     )
 
 
@@ -100,11 +98,7 @@ def figure(
 ) -> Figure:
     """Drives on the top view of their world: ways, starts, ends and bumps (Fig 4.20).
 
-    Args:
-        world: Where they drove.
-        traces: At least one.
-        title: What stands above.
-        events: Of the first drive; their numbers stand beside the way.
+    The events are those of the first drive; their numbers stand beside the way.
     """
     sheet, (x0, y0, x1, y1) = Figure(dpi=DPI, layout="constrained"), world.bounds
     sheet.set_size_inches(WIDTH_IN, WIDTH_IN * (y1 - y0) / (x1 - x0) + LEGEND_IN)
