@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from experiments.runs.watching import Watch
+from experiments.runs.totals import Watch
 from experiments.single_process import SingleProcess, TurnDone
 from shared.errors import StateError
 from shared.facts import IMAGE_BYTES, IMAGE_SHAPE

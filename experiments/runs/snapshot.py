@@ -75,8 +75,7 @@ def exists(folder: Path) -> bool:
 def restore(folder: Path, loop: SingleProcess) -> dict[str, Any]:
     """Bring a new loop to the saved state; returns `extra`.
 
-    Raises:
-        StateError: The snapshot is damaged, or of another network or seed.
+    Raises StateError: the snapshot is damaged, or of another network or seed.
     """
     episode = checkpoint.read(folder / CHECKPOINT, loop.trainer, _identity(loop)).episode
     try:

@@ -13,17 +13,9 @@ from shared.rl.retention.strategy import begin
 
 
 def enter(loop: SingleProcess, plan: Plan, stage: Stage, config: Config, *, first: bool) -> None:
-    """Let the loop go on in a stage.
+    """Let the loop go on in a stage, between two turns; `first`: the run begins with it.
 
-    Args:
-        loop: The loop, between two turns.
-        plan: Plan of the run.
-        stage: The stage.
-        config: Configuration of the stage.
-        first: Whether the run begins with this stage.
-
-    Raises:
-        ConfigError: The driver refuses a change of the world.
+    Raises ConfigError when the driver refuses a change of the world.
     """
     before = loop.config
     loop.reconfigure(config)
@@ -46,11 +38,7 @@ def enter(loop: SingleProcess, plan: Plan, stage: Stage, config: Config, *, firs
 
 
 def change_world(loop: SingleProcess, plan: Plan, stage: Stage, totals: Totals) -> None:
-    """Tell the driver of the changes that are due in the next episode.
-
-    Raises:
-        ConfigError: The driver refuses one.
-    """
+    """Tell the driver of what is due in the next episode. Raises ConfigError when it refuses."""
     following = totals.done(loop, plan.counted_in) + 1
     for change in stage.changes[totals.changes :]:
         if change["at"] > following:

@@ -44,7 +44,7 @@ def experiment(
 
     A plan that begins with the end of another runs that one first.
     """
-    commands = import_installed("experiments.runs.commands", "experiments")
+    commands = import_installed("experiments.runs.schedule", "experiments")
     if not names:
         typer.echo(commands.listing())
         return
@@ -72,7 +72,7 @@ def retention(
 
     Run again, it goes on. A stream takes a gigabyte.
     """
-    command = import_installed("experiments.retention.command", "experiments")
+    command = import_installed("experiments.retention.work", "experiments")
     console = import_installed("rich.console", "experiments").Console()
     raise typer.Exit(command.run(setting, seed or [], entry or [], out, console))
 

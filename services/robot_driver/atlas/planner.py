@@ -13,15 +13,19 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
-from services.robot_driver.atlas.action_geometry import CONTACT_M, ActionGeometry, Floats
-from services.robot_driver.atlas.pose_grid import PoseGrid, Table
+from services.robot_driver.atlas.action_geometry import CONTACT_M, TURNS, ActionGeometry, Floats
 from services.robot_driver.simulated.world import World
 from shared.facts import ACTION_COUNT
 
 Ints = npt.NDArray[np.int64]
+Table = npt.NDArray[np.float32]
+"""float32 [headings, rows, columns]: rows run along y, columns along x, from the lower corner."""
+_WAY_POINTS = 5
+"""Points at which the way of one action is looked at."""
 
 _DISCOUNT = 0.99
 _SWEEPS = 250
@@ -55,14 +59,9 @@ class _Aim:
 
 
 class Planner:
-    """Tables for one world and one robot.
+    """Tables for one world and one robot, over a grid of positions and headings.
 
-    Args:
-        world: The map.
-        geometry: Geometry of the three actions.
-        cell_m: Grid distance of positions.
-        headings: Number of grid headings.
-        horizon: Actions a saved run lasts.
+    horizon: Actions that a saved run lasts.
     """
 
     def __init__(
@@ -91,18 +90,13 @@ class Planner:
     def race(
         self, pose: Floats, actions: int, direction: int, keep_m: float = 0.005
     ) -> PlannedRuns:
-        """The planned run from one pose [3] with most net angle round the lap centre.
+        """The planned run from one pose (x, y, heading) with most net angle round the lap centre.
 
         Where the room to keep cannot be kept, it makes for more room first.
 
-        Args:
-            pose: x, y, heading.
-            actions: Length of the run.
-            direction: 1 anticlockwise, -1 clockwise.
-            keep_m: Room to keep to all walls.
+        direction: 1 anticlockwise, -1 clockwise. keep_m: Room to keep to all walls.
 
-        Raises:
-            ValueError: The world has no lap centre.
+        Raises ValueError for a world without a lap centre.
         """
 
         def turned(before: Floats, after: Floats) -> Floats:
@@ -116,8 +110,7 @@ class Planner:
     def winding(self, poses: Floats) -> Floats:
         """Net angle round the lap centre along float64 [steps, 3], radians, float64 [steps].
 
-        Raises:
-            ValueError: The world has no lap centre.
+        Raises ValueError for a world without a lap centre.
         """
         angle = np.unwrap(self._bearing(poses))
         return np.asarray(angle - angle[0])
@@ -197,6 +190,95 @@ class Planner:
             raise ValueError(f"world {self.world.name!r} has no lap centre")
         cx, cy = self.world.lap.centre
         return np.asarray(np.arctan2(poses[:, 1] - cy, poses[:, 0] - cx))
+
+
+class PoseGrid:
+    """Poses in a rectangle.
+
+    bounds: x and y of the lower corner, x and y of the upper corner, metres.
+    """
+
+    def __init__(
+        self,
+        bounds: tuple[float, float, float, float],
+        geometry: ActionGeometry,
+        cell_m: float,
+        headings: int,
+    ) -> None:
+        self.headings = headings
+        self._geometry, self._cell_m = geometry, cell_m
+        x0, y0, x1, y1 = bounds
+        self._origin = np.array([x0, y0])
+        columns, rows = math.ceil((x1 - x0) / cell_m) + 1, math.ceil((y1 - y0) / cell_m) + 1
+        y, x = np.mgrid[0:rows, 0:columns] * cell_m
+        self.shape = rows, columns
+        self.points: Floats = np.column_stack([x.ravel() + x0, y.ravel() + y0])
+        """float64 [rows * columns, 2]: the positions."""
+
+    @property
+    def heading_step(self) -> float:
+        """Angle between two grid headings, radians."""
+        return 2.0 * math.pi / self.headings
+
+    def least_on_way(self, plane: Table, action: int) -> Table:
+        """Least value of a plane [rows, columns] on the way of one action from each grid pose."""
+        parts = [(i + 1) / _WAY_POINTS for i in range(_WAY_POINTS)]
+        return np.stack(
+            [
+                np.minimum.reduce([self._shifted(plane, h, action, p, -1.0) for p in parts])
+                for h in range(self.headings)
+            ]
+        )
+
+    def after(self, table: Table, action: int, outside: float) -> Table:
+        """The table's values where one action leads from each grid pose, interpolated."""
+        turn = TURNS[action] * self._geometry.turn_rad / self.heading_step
+        low = math.floor(turn + 1e-9)
+        part = np.float32(turn - low) if turn - low > 1e-9 else np.float32(0.0)
+        ahead = np.roll(table, -low, axis=0)
+        if part:
+            ahead = (1 - part) * ahead + part * np.roll(table, -low - 1, axis=0)
+        return np.stack(
+            [self._shifted(ahead[h], h, action, 1.0, outside) for h in range(self.headings)]
+        )
+
+    def _shifted(self, plane: Table, h: int, action: int, part: float, outside: float) -> Table:
+        """One heading's plane, read at the place where part of an action leads."""
+        there = self._geometry.move(np.array([[0.0, 0.0, h * self.heading_step]]), action, part)[0]
+        dx, dy = there[0] / self._cell_m, there[1] / self._cell_m
+        return np.asarray(
+            cv2.warpAffine(
+                plane,
+                np.array([[1.0, 0.0, dx], [0.0, 1.0, dy]]),
+                (plane.shape[1], plane.shape[0]),
+                flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+                borderMode=cv2.BORDER_CONSTANT,
+                borderValue=(outside,),
+            ),
+            np.float32,
+        )
+
+    def look_up(self, table: Table, poses: Floats) -> Floats:
+        """Interpolated values of a table at float64 [n, 3], float64 [n]; grid edges repeat."""
+        rows, columns = self.shape
+        grid = (poses[:, :2] - self._origin) / self._cell_m
+        x = np.clip(grid[:, 0], 0.0, columns - 1.001)
+        y = np.clip(grid[:, 1], 0.0, rows - 1.001)
+        h = np.remainder(poses[:, 2] / self.heading_step, self.headings)
+        result = np.zeros(len(poses))
+        for dh in (0, 1):
+            for dy in (0, 1):
+                for dx in (0, 1):
+                    weight = np.ones(len(poses))
+                    for value, far in ((h, dh), (y, dy), (x, dx)):
+                        rest = value - np.floor(value)
+                        weight *= rest if far else 1.0 - rest
+                    result += weight * table[
+                        (np.floor(h).astype(np.int64) + dh) % self.headings,
+                        np.floor(y).astype(np.int64) + dy,
+                        np.floor(x).astype(np.int64) + dx,
+                    ]  # fmt: skip
+        return result
 
 
 def _wrap(angle_rad: Floats) -> Floats:

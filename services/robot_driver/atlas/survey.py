@@ -57,8 +57,7 @@ def problems_in(path: Path, config: Config) -> list[str]:
 def survey(config: Config, world: World) -> Figures:
     """Measure the configured robot in a world, about a minute for each hundred square metres.
 
-    Returns:
-        Named figures: lengths in metres, angles in degrees.
+    The figures have names; lengths are in metres, angles in degrees.
     """
     geometry = ActionGeometry.of(config.robot)
     robot = SimRobot(config.robot, world, config.run.seed)

@@ -111,10 +111,7 @@ class EmulatedBase:
     Time passes by `step` alone. Commands take effect `delay_s` after they arrived; the watchdog
     looks at the delayed commands, so that silence too takes the delay to become noticed.
 
-    Args:
-        body: What is moved.
-        dynamics: Figures of the base.
-        now_s: Time at the start, on the clock that `command` tells.
+    now_s: Time at the start, on the clock that `command` tells.
     """
 
     def __init__(self, body: Body, dynamics: BaseDynamics, now_s: float) -> None:

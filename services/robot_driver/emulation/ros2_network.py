@@ -17,11 +17,7 @@ SENSORS = ("odometry", "camera", "bumper", "battery")
 
 
 class Network:
-    """One session of the robot: its keys, tokens and publishers.
-
-    Raises:
-        ConfigError: It cannot listen there.
-    """
+    """One session of the robot: keys, tokens, publishers. Raises ConfigError: it cannot listen."""
 
     def __init__(self, listen: str, ros: Ros2Config, inbox: RawInbox) -> None:
         self._ros, self._inbox = ros, inbox
