@@ -39,12 +39,7 @@ SHARES = ("distance", "coverage", "circling")
 def run(path: Path, config: Config, starts: int, actions: int, out: Path) -> None:
     """Evaluate in the configured world; print a table, write `evaluation.csv`, routes and pictures.
 
-    Args:
-        path: Folder of a run, or a file of weights.
-        config: World, robot and shape of the network.
-        starts: Number of drives.
-        actions: Of each drive.
-        out: Folder, made if missing.
+    path: The folder of a run, or a file of weights.
 
     Raises:
         ConfigError: No such run, no such world, another shape of network, or an unwritable folder.

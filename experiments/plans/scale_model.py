@@ -27,10 +27,7 @@ SMALL_MEMORY = f"a memory holds at least {LEAST_CAPACITY} samples, one long epis
 def numbers(plan: Plan, index: int, length: float) -> Numbers:
     """The numbers of a stage; those of what the stage does not do are left out.
 
-    Args:
-        plan: The plan at its scale.
-        index: Which of its stages.
-        length: Mean actions of an episode.
+    length: Mean actions of an episode.
     """
     config = stage_config(plan, index, seed=1)
     memory, learning = config.memory, config.learning
@@ -99,11 +96,7 @@ def description(name: str, scale: str) -> str:
 def _steps(config: Config, actions: float, fits: float, length: float) -> float:
     """Gradient steps of this many actions, on average.
 
-    Args:
-        config: The configuration.
-        actions: How many.
-        fits: Actions between fitting phases; 0: there are none.
-        length: Mean actions of an episode.
+    fits: Actions between fitting phases; 0: there are none. length: Mean actions of an episode.
     """
     learning = config.learning
     steps = learning.mini_batches_per_episode / length

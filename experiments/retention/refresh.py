@@ -61,13 +61,7 @@ class Refresher:
         self.needs_next = way == "next-value"
 
     def note(self, first: int, count: int, network: Predictor) -> None:
-        """Note what the network in force expects after new samples.
-
-        Args:
-            first: Place of the first one in the stream.
-            count: How many.
-            network: The one that computed their rewards.
-        """
+        """Note what the network in force expects after `count` new samples from this place on."""
         if self.needs_next:
             places = np.arange(first, first + count)
             self._then[places] = self._values_of_next(places, network)

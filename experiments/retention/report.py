@@ -37,11 +37,7 @@ _RESULTS = TypeAdapter(tuple[Measured, ...])
 
 
 def load_measured(paths: Iterable[Path]) -> list[Measured]:
-    """Read results, of `corridor retention` or kept ones, sorted.
-
-    Raises:
-        StateError: A file is damaged.
-    """
+    """Read results, of `corridor retention` or kept ones, sorted. Raises StateError if damaged."""
     found: dict[tuple[str, str, int], Measured] = {}
     for path in paths:
         try:

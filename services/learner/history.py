@@ -29,8 +29,7 @@ class Place:
     def next_turns(self, turns: Sequence[Turn], checkpoint: object) -> tuple[Turn, ...]:
         """The turns to do, in order, of replay's answer to what comes after `since`.
 
-        Raises:
-            StateError: Replay's memory is not the one that the checkpoint was made with.
+        Raises StateError: replay's memory is not the one that the checkpoint was made with.
         """
         if self.episode:
             if not turns or turns[0].episode != self.episode:

@@ -84,8 +84,7 @@ def decode_odometry(data: bytes) -> Stamped[Pose]:
 def decode_camera(data: bytes, kind: CameraType) -> Stamped[RgbImage]:
     """The picture of a sensor_msgs/Image or CompressedImage: uint8 [h, w, 3], RGB.
 
-    Raises:
-        BadMessage: Also for what `picture.py` refuses, and depth images.
+    Raises BadMessage also for what `picture.py` refuses, and depth images.
     """
     message = decode(data, kind)
     if kind == "CompressedImage":

@@ -139,8 +139,7 @@ class Link(Protocol):
     def send(self, velocity: Velocity) -> None:
         """Send one command, newest wins; returns within a command period.
 
-        Raises:
-            RobotFault: It could not be handed over; a later call may succeed.
+        Raises RobotFault: it could not be handed over; a later call may succeed.
         """
 
     def close(self) -> None:

@@ -69,11 +69,7 @@ def check(
     clock: Callable[[], float] = time.monotonic,
     wait: Callable[[float], object] = time.sleep,
 ) -> list[str]:
-    """Look at a robot for a while; returns what keeps it from driving.
-
-    Raises:
-        RobotMissing: It cannot be reached.
-    """
+    """Look at a robot for a while; returns what keeps it from driving. Raises RobotMissing."""
     try:
         link.open()
     except RobotFault as error:
