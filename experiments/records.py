@@ -14,8 +14,6 @@
 Every column but `seconds` is a function of the configuration, the seed and the numerics.
 """
 
-from __future__ import annotations
-
 from pydantic import BaseModel, ConfigDict, Field
 
 EVALUATION_COLUMNS = (

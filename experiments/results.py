@@ -8,8 +8,6 @@ Without RUNS it writes the page from what is kept, which gives the same page aga
 this name and the findings about it. Names are those of the full report (`corridor report`).
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ All of it is about rates of bumps, compared seed by seed as differences of their
 exponential of such a difference is the ratio of the rates: below 1 the first one bumps less.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

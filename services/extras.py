@@ -1,7 +1,5 @@
 """Modules of ours whose libraries come with an extra of the package, and may not be installed."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from typing import Any

@@ -1,7 +1,5 @@
 """Says what is wrong without a flood: one line for each kind and minute, the others are counted."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 

@@ -5,8 +5,6 @@ refused here, before anything starts, with one `ConfigError` line that names the
 expected, what came and where it came from. The folder of a run belongs to one configuration.
 """
 
-from __future__ import annotations
-
 import difflib
 import json
 import re

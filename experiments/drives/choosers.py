@@ -1,7 +1,5 @@
 """Who drives when nothing is learnt: a frozen network, the planner that knows the map, chance."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol

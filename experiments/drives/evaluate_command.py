@@ -1,7 +1,5 @@
 """`corridor evaluate`: what the network of a run can do, beside planner and random actions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 

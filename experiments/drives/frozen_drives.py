@@ -5,8 +5,6 @@ and acts greedily. `planner` and `random` drive through the same code and are th
 floor. They depend on world, robot and starts alone: they are driven once and kept beside the runs.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

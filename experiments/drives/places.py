@@ -1,7 +1,5 @@
 """Where a robot can be in a world: free cells to be covered, poses to start from."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

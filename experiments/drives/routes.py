@@ -1,7 +1,5 @@
 """The way of drives: on disk, and drawn on the top view of their world."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ nothing good (`shared.rl.spot_turns`). At a junction towards the end a box is dr
 the robot.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ Circling on the spot bumps into nothing. That is why bumps never stand alone her
 where the robot was, laps, coverage and circling tell whether it gets anywhere.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ it. `full` has the exact constants, computed on a GPU where there is one. What s
 of a plan is the business of `scales`.
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Iterable, Mapping
 from importlib import resources

@@ -4,8 +4,6 @@ Reports know no experiment by name. What is shown together, what is compared wit
 the thesis lets one expect stands in the plans.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator

@@ -4,8 +4,6 @@ A smaller experiment is a model of the large one where these numbers agree. Acti
 memories: N actions renew a memory once.
 """
 
-from __future__ import annotations
-
 from experiments.plans.plan import Plan, full_plan, stage_config
 from experiments.plans.scales import LEAST_CAPACITY, divisor_of, episode_actions, scaled
 from shared.config import Config

@@ -5,8 +5,6 @@ in episodes is counted in actions there, since the length of episodes depends on
 memory is renewed, equalised and learnt from as often as in the thesis.
 """
 
-from __future__ import annotations
-
 from importlib.resources.abc import Traversable
 from typing import NamedTuple
 

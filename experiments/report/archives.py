@@ -4,8 +4,6 @@ An archive is a tar file compressed with xz. Its members are called `seed-<n>/<f
 those that a run writes (`experiments/records.py`).
 """
 
-from __future__ import annotations
-
 import io
 import lzma
 import re

@@ -6,8 +6,6 @@ surely does not: the whole 95 % interval (Wilson) of the share of seeds lies on 
 That takes at least four seeds that agree.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from math import inf, isfinite
 

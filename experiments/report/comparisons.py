@@ -4,8 +4,6 @@ Which experiments stand together and which are compared is told by their plans
 (`experiments/plans/presentation.py`): those of one group, and the comparisons that a plan names.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple

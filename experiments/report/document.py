@@ -1,7 +1,5 @@
 """A page of figures, tables and sentences, written as Markdown or as one HTML file."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass

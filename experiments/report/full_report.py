@@ -4,8 +4,6 @@ One HTML page that needs no other file, one Markdown page per experiment, and on
 the comparisons. A figure whose data are missing is left out, with a line that says so.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from importlib.resources.abc import Traversable
 from pathlib import Path

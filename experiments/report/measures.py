@@ -1,7 +1,5 @@
 """Single numbers of runs, and how they are written."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from itertools import dropwhile, takewhile

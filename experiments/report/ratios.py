@@ -1,7 +1,5 @@
 """Rates of bumps compared seed by seed: tables, a figure and sentences (docs/comparison.md)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import NamedTuple

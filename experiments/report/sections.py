@@ -1,7 +1,5 @@
 """The section of one experiment: its figures and tables, and sentences about them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path

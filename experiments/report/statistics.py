@@ -1,7 +1,5 @@
 """Curves of seeds, and seeds together: pure functions of arrays."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

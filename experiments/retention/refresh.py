@@ -5,8 +5,6 @@ early policy went in the 50 actions that followed. Equalisation (Eq 3.5) moves i
 network predicts now.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Literal
 

@@ -6,8 +6,6 @@ adds the results in the folder MEASURED (`<out>/measured` of `corridor retention
 kept with the code.
 """
 
-from __future__ import annotations
-
 import json
 import lzma
 import sys

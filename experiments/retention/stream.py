@@ -10,8 +10,6 @@ A run that is stopped and goes on continues its stream: what was written after i
 cut off and comes again.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass

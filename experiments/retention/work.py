@@ -7,8 +7,6 @@
 Run again, it goes on: what is measured is left alone, and a recording continues.
 """
 
-from __future__ import annotations
-
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Looks at the network of a run with robots of its own, so that nothing of the run is disturbed."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -5,8 +5,6 @@ interrupted at any moment goes on from its last snapshot as if nothing had happe
 recorded after that snapshot is written again.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict

@@ -4,8 +4,6 @@
 time on two cores. Run again, it goes on where it was stopped; finished runs are left alone.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import queue

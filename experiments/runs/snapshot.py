@@ -1,7 +1,5 @@
 """The whole state of a single-process run on disk: a run goes on from it bit for bit (A46)."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

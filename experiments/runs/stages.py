@@ -1,7 +1,5 @@
 """Puts a stage of a plan into effect: configuration, world, retention and capacity of the loop."""
 
-from __future__ import annotations
-
 from experiments.plans.plan import Plan, Stage, merged
 from experiments.runs.totals import Totals
 from experiments.single_process import SingleProcess

@@ -1,7 +1,5 @@
 """What a run counts beside its loop, and what it tells of itself while it goes on."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

@@ -1,7 +1,5 @@
 """One robot at the actor: where its turn stands, from observation to acknowledged episode."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Collection
 from concurrent.futures import Future

@@ -1,7 +1,5 @@
 """The commands about experiments and what runs leave behind: run, report, evaluate."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

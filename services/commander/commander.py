@@ -4,8 +4,6 @@ To the driver it is an actor: it answers observations. Others see it as the serv
 is that of the robot; the actor of a run, `main`, serves all of them.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager

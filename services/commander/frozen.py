@@ -1,7 +1,5 @@
 """Networks that a run left behind, for driving without learning."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -4,8 +4,6 @@ It answers the robot's observations as an actor would, so every limit of the dri
 are cut, contact stops, silence stops. The robot creeps and turns on the spot; it does nothing else.
 """
 
-from __future__ import annotations
-
 import os
 import select
 import sys

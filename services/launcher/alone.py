@@ -1,7 +1,5 @@
 """A robot without a run: router and driver for as long as somebody commands the robot."""
 
-from __future__ import annotations
-
 import os
 import threading
 import time

@@ -1,7 +1,5 @@
 """Where the learner stands in the history of the memory, and which turns follow from there."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

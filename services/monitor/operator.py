@@ -1,7 +1,5 @@
 """What a person tells a run from outside: stop, emergency stop, pause, another world, and back."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from typing import Any, TypeVar

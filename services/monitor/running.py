@@ -1,7 +1,5 @@
 """Holding the folder of a run that is up (`shared.place`), and how to reach a run."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import time

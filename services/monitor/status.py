@@ -1,7 +1,5 @@
 """`corridor status`: who is alive in a run, and what each last told about itself."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 A recording whose writer was killed ends in the middle; what came before is read.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import struct

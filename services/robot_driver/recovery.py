@@ -4,8 +4,6 @@ It uses nothing but `drive`, `run` and `feel`, so it serves simulated and real r
 bumper has one bit for the whole ring: a pressed bumper cannot tell front from rear.
 """
 
-from __future__ import annotations
-
 import math
 
 from services.robot_driver.host import Host

@@ -3,8 +3,6 @@
 Two more look at the image alone, and other weights do not change them. All have 120 bits.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 import torch

@@ -1,7 +1,5 @@
 """Which samples look like newer ones (A30): the search behind replay memory management."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Literal
 

@@ -5,8 +5,6 @@ turns on the spot instead: to the left if its action turns left, else to the rig
 direction until an action with a prediction of 0 or more comes up.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Drives of frozen networks: curves over actions."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """What the replay memory holds, by action and by corridor (Fig 4.6, 4.11, 4.15)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Images and the rewards that networks predict for them (Fig 4.7, 4.10, 4.16, 4.17, 4.19)."""
 
-from __future__ import annotations
-
 import string
 from collections.abc import Mapping
 from typing import NamedTuple

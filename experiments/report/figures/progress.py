@@ -1,7 +1,5 @@
 """Fitness and loss over episodes (Fig 4.4, 4.5, 4.9, 4.12, 4.14)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How figures look: sizes, a palette that colour-blind people can tell apart, stages."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Iterable, Sequence
 from functools import wraps

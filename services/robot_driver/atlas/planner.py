@@ -7,8 +7,6 @@ and exact geometry, so a real sequence of actions reaches it. A pose called save
 called lost might still be saved by a better plan.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 `corridor world check` prints the result of `problems_in`, or, if there are none, of `survey`.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pictures of a world for people: a map from above and what the camera sees from several places."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Measured figures of a Robotino and the published ones of a Create 3; what is not
 the worse case. Units are SI.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from dataclasses import dataclass, replace

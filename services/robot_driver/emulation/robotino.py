@@ -4,8 +4,6 @@ Beside the robot's own paths there are two for tests, which no fault reaches: `/
 (GET, POST) and `/emulator/truth` (GET).
 """
 
-from __future__ import annotations
-
 import json
 import math
 import signal

@@ -1,7 +1,5 @@
 """The keys, tokens and publishers of an emulated ROS 2 robot on its Zenoh network."""
 
-from __future__ import annotations
-
 import secrets
 import time
 from typing import Literal

@@ -1,7 +1,5 @@
 """An emulated base in a simulated world, running by the wall clock in a thread of its own."""
 
-from __future__ import annotations
-
 import threading
 import time
 from dataclasses import asdict, dataclass

@@ -7,8 +7,6 @@ angles counter-clockwise. Stamps are nanoseconds of the robot's clock; 0: none t
 The reason of a BadMessage comes first and is of a small vocabulary, details follow a colon.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar

@@ -4,8 +4,6 @@ A velocity is a lease that the driver renews by its own calls. Contact, a lease 
 whatever else forbids motion turn it into standstill here, whoever asked for it.
 """
 
-from __future__ import annotations
-
 import math
 
 from services.robot_driver.robot import STANDSTILL, RobotFault, Velocity

@@ -4,8 +4,6 @@ A link has threads or callbacks of its own that put the newest readings into slo
 (`hardware.py`) takes them out, judges their age, and owns every decision about motion.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections import Counter

@@ -5,8 +5,6 @@ robot says counts only while it is fresh: liveliness tokens tell types, never th
 (a cut-off robot's tokens stay for ten seconds).
 """
 
-from __future__ import annotations
-
 import logging
 import secrets
 import threading

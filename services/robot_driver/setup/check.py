@@ -1,7 +1,5 @@
 """`corridor robot check`: every sensor of a real robot, looked at for a while; nothing moves."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ A base waits for its delay, speeds up evenly, then goes on at a steady speed. Th
 of the last part of the way. The delay is the one with which such a base comes closest to the rest.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

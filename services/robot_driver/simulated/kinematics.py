@@ -1,7 +1,5 @@
 """Where a body velocity leads on a floor without walls, and the laps round a centre."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ windows, notice boards, radiators) are painted onto segments. Obstacles are boxe
 Units are metres and degrees, x to the right and y up on the map.
 """
 
-from __future__ import annotations
-
 import hashlib
 import tomllib
 from collections.abc import Collection
