@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from experiments.drives import routes
 from experiments.plans.presentation import Presentation
 from experiments.report.document import Block, Findings, Missing, Picture, Section, Table, table
-from experiments.report.figures import drives, memory, probes, progress
+from experiments.report.figures import drives, probes, progress
 from experiments.report.measures import (
     MEASURED,
     evaluated,
@@ -156,11 +156,11 @@ def _memory(this: _Shown) -> list[Block]:
     if not all(len(run.episodes) for run in runs):
         return [Missing("samples in the memory", "a seed has no episodes yet")]
     caption = f"Samples in the replay memory by action. {this.seeds}"
-    drawn = partial(memory.by_action, this.experiment)
+    drawn = partial(progress.by_action, this.experiment)
     blocks: list[Block] = [this.picture("memory", "Memory by action", caption, drawn)]
     if any(len(run.samples_by_world) > 1 for run in runs):
         caption = f"Samples in the replay memory by corridor. {this.seeds}"
-        drawn = partial(memory.by_world, this.experiment)
+        drawn = partial(progress.by_world, this.experiment)
         blocks.append(this.picture("worlds", "Memory by corridor", caption, drawn))
     elif theirs := this.plan.figures.get("worlds"):
         blocks.append(Missing(f"memory by corridor ({theirs})", "samples of one corridor only"))
