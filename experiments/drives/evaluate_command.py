@@ -85,7 +85,8 @@ def _drive(
     try:
         out.mkdir(parents=True, exist_ok=True)
         routes.write(out / f"route-{name}.npz", routes.Route(done.traces[0]))
-        routes.draw(out / f"routes-{name}.png", env.world, done.traces, title)
+        picture = routes.figure(env.world, done.traces, title)
+        picture.savefig(out / f"routes-{name}.png", format="png")
     except OSError as error:
         raise ConfigError(f"{out}: cannot be written: {error.strerror}") from error
     return done.figures

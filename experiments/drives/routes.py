@@ -3,6 +3,7 @@
 import json
 import zipfile
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -84,11 +85,6 @@ def read(path: Path) -> Route:
     if sizes != (n + 1, n + 1, n):
         raise StateError(f"{path}: expected places, headings, ways of {n} actions, got {sizes}")
     return Route(trace, events)
-
-
-def draw(path: Path, world: World, traces: Sequence[Trace], title: str) -> None:
-    """The same as `figure`, written to a PNG file."""
-    figure(world, traces, title).savefig(path, format="png")
 
 
 def figure(
@@ -191,16 +187,16 @@ def _driven(trace: Trace) -> list[npt.NDArray[np.float64]]:
 def _legend(
     traces: Sequence[Trace], marks: Sequence[tuple[npt.NDArray[np.float64], str, str, str]]
 ) -> list[Line2D]:
+    def counted(count: int, name: str) -> str:
+        return f"{count} {name}{'' if count == 1 else 's'}"
+
     actions = sum(len(trace.bumps) for trace in traces)
-    drives = "1 drive" if len(traces) == 1 else f"{len(traces)} drives"
-    handles = [Line2D([], [], color=_WAY, label=f"{drives}, {actions} actions")]
-    for places, marker, colour, name in marks:
-        label = f"{len(places)} {name}{'' if len(places) == 1 else 's'}"
-        handles.append(
-            Line2D([], [], color=colour, marker=marker, linestyle="", label=label,
-                   markeredgewidth=1.6)
-        )  # fmt: skip
-    return handles
+    label = f"{counted(len(traces), 'drive')}, {actions} actions"
+    mark = partial(Line2D, [], [], linestyle="", markeredgewidth=1.6)
+    return [
+        Line2D([], [], color=_WAY, label=label),
+        *(mark(color=c, marker=m, label=counted(len(at), name)) for at, m, c, name in marks),
+    ]
 
 
 def _scale_bar(figure: Figure, world: World) -> None:
