@@ -45,8 +45,7 @@ def load(
         overrides: `section.key=value` texts from the command line, later ones win.
         env: the environment; `CORRIDOR_<SECTION>__<KEY>` is read from it.
 
-    Raises:
-        ConfigError: on the first problem of any source.
+    Raises ConfigError on the first problem of any source.
     """
     merged = _Merged()
     if preset is not None:

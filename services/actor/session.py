@@ -132,12 +132,7 @@ class Session:
         self._publish(action)
 
     def heartbeat(self, undecodable: int, busy: int) -> ActorState:
-        """What the actor tells of this robot.
-
-        Args:
-            undecodable: messages that the actor could not take, of all robots together.
-            busy: messages for which it had no room.
-        """
+        """What the actor tells of this robot; `undecodable` and `busy` are those of all."""
         now_s, (then_s, count) = time.monotonic(), self._counted
         rate = (self.actor.actions - count) / max(now_s - then_s, 1e-6)
         self._counted = (now_s, self.actor.actions)

@@ -50,10 +50,8 @@ class Commander:
     def observe(self, timeout_s: float) -> Observation | None:
         """The newest observation that waits for an answer; None when none came in time.
 
-        One that was answered already has not reached the driver: the answer is sent again.
-
-        Raises:
-            RobotTaken: Somebody else began to command the robot.
+        One that was answered already has not reached the driver: the answer is sent again. Raises
+        RobotTaken when somebody else began to command the robot.
         """
         self._look_round()
         self._inbox.wait(timeout_s)

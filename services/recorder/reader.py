@@ -57,12 +57,8 @@ class _File(BufferedReader):
 class Recording:
     """A recording in a file; every pass over it begins anew.
 
-    Args:
-        path: The file.
-
-    Raises:
-        ConfigError: There is no such file.
-        StateError: It is no recording of this project, or is damaged at its beginning.
+    Raises ConfigError: there is no such file; StateError: it is no recording of this project, or is
+    damaged at its beginning.
     """
 
     def __init__(self, path: Path) -> None:
