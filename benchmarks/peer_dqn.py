@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from gymnasium.wrappers import TimeLimit
 
-from experiments.baseline import sb3
+from benchmarks import sb3
 from experiments.environment import CorridorEnv
 from shared.config import Config
 

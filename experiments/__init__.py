@@ -6,5 +6,4 @@ plans       experiments as data
 drives      drives of frozen networks, of the planner and of random actions
 runs        runs of plans with seeds, stopped and continued
 report      figures, tables and findings of runs
-baseline    DQN on the same environment
 """

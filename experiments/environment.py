@@ -4,8 +4,6 @@ Importing this module registers them; `gymnasium.make("experiments.environment:C
 does both at once. The single-process loop and all evaluation run on the same class.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -8,8 +8,6 @@ Without RUNS it writes the page from what is kept, which gives the same page aga
 this name and the findings about it. Names are those of the full report (`corridor report`).
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Sequence
@@ -32,8 +30,7 @@ _SHOWN = re.compile(r"<!-- show: (\S+) -->")
 def write_results_page(docs: Path) -> None:
     """Write `results.md` and its pictures from what is kept, and remove other pictures.
 
-    Raises:
-        StateError: An archive is damaged, or the text names what no kept run gives.
+    Raises StateError: an archive is damaged, or the text names what no kept run gives.
     """
     text, shown = results_page(docs)
     images = docs / "images" / "results"
@@ -46,11 +43,7 @@ def write_results_page(docs: Path) -> None:
 
 
 def results_page(docs: Path) -> tuple[str, list[Picture]]:
-    """Text of the page and the pictures it shows, from what is kept; nothing is drawn yet.
-
-    Raises:
-        StateError: As for `write_results_page`.
-    """
+    """Text of the page and the pictures it shows, not drawn yet. Raises as `write_results_page`."""
     source = docs / "results" / "page.template"
     kept = sorted((docs / "results").glob(f"*{archives.SUFFIX}"))
     sections = [*all_sections(archives.load(kept)), *kept_section(docs / "results")]

@@ -8,8 +8,6 @@ can use too. The distributed system in lockstep with synchronous learning comput
 rewards, memory, marks and weights, bit for bit; tests/system compares the two.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ All of it is about rates of bumps, compared seed by seed as differences of their
 exponential of such a difference is the ratio of the rates: below 1 the first one bumps less.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -65,11 +63,7 @@ def log_rates(bumps: Floats, actions: Floats) -> Floats:
 
 
 def paired(ours: Floats, theirs: Floats) -> Paired:
-    """Compare logarithms of rates, seed by seed: float64 [n] each, n at least 2.
-
-    Raises:
-        ValueError: There are too few seeds, or not equally many.
-    """
+    """Compare logs of rates by seed: float64 [n] each. Raises ValueError unless n is 2 or more."""
     if len(ours) != len(theirs) or len(ours) < 2:
         raise ValueError(f"expected as many seeds, at least 2, got {len(ours)} and {len(theirs)}")
     differences = ours - theirs

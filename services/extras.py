@@ -1,7 +1,5 @@
 """Modules of ours whose libraries come with an extra of the package, and may not be installed."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from typing import Any
@@ -10,11 +8,7 @@ from shared.errors import ConfigError
 
 
 def import_installed(module: str, extra: str) -> Any:
-    """Import a module of ours that needs the libraries of an extra.
-
-    Raises:
-        ConfigError: one of these libraries is not installed.
-    """
+    """Import a module of ours that needs the libraries of an extra. Raises ConfigError."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:

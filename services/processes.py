@@ -4,8 +4,6 @@ The command line, `corridor up`, status, stop, health checks and the tests of th
 read it. Recording and driving without learning are commands that join a run; they are not in it.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass

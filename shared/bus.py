@@ -1,7 +1,5 @@
 """Everything that touches Zenoh: sessions, publishing, subscribing, requests, liveliness."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable, Iterator

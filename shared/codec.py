@@ -1,7 +1,5 @@
 """Messages to msgpack bytes and back: nothing is executed, sizes and types are checked first."""
 
-from __future__ import annotations
-
 from reprlib import repr as brief
 from typing import Any, TypeVar
 

@@ -1,7 +1,5 @@
 """Values of many samples as bytes and back: types and shapes of episodes and changes stand here."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

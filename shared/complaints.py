@@ -1,7 +1,5 @@
 """Says what is wrong without a flood: one line for each kind and minute, the others are counted."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 
@@ -11,9 +9,7 @@ PERIOD_S = 60.0
 class Complaints:
     """What one thread complains of. Kinds come from the code, never from a message: they are few.
 
-    Args:
-        say: Writes a line, such as a logger's `warning`.
-        clock: Seconds.
+    `say` writes a line, such as a logger's `warning`; `clock` tells seconds.
     """
 
     def __init__(

@@ -4,8 +4,6 @@ Each stands here once. Whatever can be derived from them (number of outputs, of 
 message) is derived. This file imports nothing of ours and needs the standard library only.
 """
 
-from __future__ import annotations
-
 import re
 from typing import Literal, NamedTuple, get_args
 

@@ -6,8 +6,6 @@ bytes into bounded places of an inbox, the one thread that owns the inbox decode
 what is not taken is counted.
 """
 
-from __future__ import annotations
-
 import re
 import time
 from collections import Counter, deque

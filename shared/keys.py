@@ -10,8 +10,6 @@ request  the sender repeats it until it is answered or its deadline is over. The
          is bounded; what does not fit is answered with the error "busy".
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from typing import Literal

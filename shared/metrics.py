@@ -1,7 +1,5 @@
 """Tables of a run that grow by a row each episode, with the same numbers for TensorBoard."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterable
 from contextlib import suppress

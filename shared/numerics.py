@@ -4,8 +4,6 @@ Chosen once, when the run first starts, and then fixed in its folder: arithmetic
 run is, and a resumed run must compute the same bits.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import logging

@@ -5,8 +5,6 @@ the lock when the process ends, however it ends. Beside it, the file `endpoint` 
 router of that run listens and, in its second line, which folder of credentials it uses.
 """
 
-from __future__ import annotations
-
 import fcntl
 from pathlib import Path
 

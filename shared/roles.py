@@ -51,11 +51,7 @@ def locked(folder: Path, service: str, ident: str, life: str) -> Iterator[None]:
 
 @contextmanager
 def claimed(bus: Bus, service: str, ident: str, life: str) -> Iterator[None]:
-    """Win a role on the bus; let the block announce the holder.
-
-    Raises:
-        RoleTaken: another process has it, or won it.
-    """
+    """Win a role on the bus; let the block announce the holder. Raises RoleTaken."""
     deadline_s = time.monotonic() + bus.config.lease_ms / 1000 + MARGIN_S
     with bus.claiming(service, ident, life):
         while (rival := _rival(bus, service, ident, life)) is not None:

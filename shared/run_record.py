@@ -255,10 +255,8 @@ def _lines(columns: tuple[str, ...], rows: Iterable[Row]) -> bytes:
 def read_csv(path: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
     """All rows of a table; none where there is no file.
 
-    A torn last line is left out. A column that the table lacks is empty in every row.
-
-    Raises:
-        ValueError: The table has another first column, or one that is not among `columns`.
+    A torn last line is left out. A column that the table lacks is empty in every row. Raises
+    ValueError for another first column, or one that is not among `columns`.
     """
     if not path.exists():
         return []
@@ -274,8 +272,7 @@ def read_csv(path: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
 def read_episodes(folder: Path) -> list[dict[str, str]]:
     """All episodes of a run folder, with what the learner service wrote about each.
 
-    Raises:
-        ValueError: A table is of another schema.
+    Raises ValueError for a table of another schema.
     """
     training = {row["episode"]: row for row in read_csv(folder / TRAINING, TRAINING_COLUMNS)}
     episodes = read_csv(folder / EPISODES, EPISODE_COLUMNS)

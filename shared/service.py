@@ -1,7 +1,5 @@
 """What all services share: connecting, being visible, stopping cleanly, logging, exit codes."""
 
-from __future__ import annotations
-
 import logging
 import math
 import os

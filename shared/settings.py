@@ -5,8 +5,6 @@ refused here, before anything starts, with one `ConfigError` line that names the
 expected, what came and where it came from. The folder of a run belongs to one configuration.
 """
 
-from __future__ import annotations
-
 import difflib
 import json
 import re
@@ -47,8 +45,7 @@ def load(
         overrides: `section.key=value` texts from the command line, later ones win.
         env: the environment; `CORRIDOR_<SECTION>__<KEY>` is read from it.
 
-    Raises:
-        ConfigError: on the first problem of any source.
+    Raises ConfigError on the first problem of any source.
     """
     merged = _Merged()
     if preset is not None:

@@ -1,7 +1,5 @@
 """Small state on disk: saved by a clean stop and taken up once, or kept for every next start."""
 
-from __future__ import annotations
-
 import errno
 import os
 import tempfile

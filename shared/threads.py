@@ -1,7 +1,5 @@
 """Threads of a service: asked to stop, failing together, waiting not all at once, and for long."""
 
-from __future__ import annotations
-
 import random
 import signal
 import threading

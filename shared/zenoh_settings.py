@@ -1,7 +1,5 @@
 """How sessions of ours are configured. It imports Zenoh alone, so that a stop is quick."""
 
-from __future__ import annotations
-
 import json
 import logging
 import re

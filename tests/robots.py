@@ -8,8 +8,7 @@ from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import dataclass
 
 from benchmarks.waiting import wait_until
-from services.robot_driver.emulation.robotino import EmulatedRobotino, RobotinoServer
-from services.robot_driver.emulation.robotino_faults import Faults
+from services.robot_driver.emulation.robotino import EmulatedRobotino, Faults, RobotinoServer
 from services.robot_driver.emulation.ros2 import EmulatedRos2
 from services.robot_driver.emulation.ros2_faults import Ros2Faults
 from services.robot_driver.kinds import make_robot

@@ -1,7 +1,5 @@
 """Who drives when nothing is learnt: a frozen network, the planner that knows the map, chance."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
@@ -57,17 +55,6 @@ def greedy(network: Predicts) -> Chooser:
     ) -> list[int]:
         values = network.all_values(np.stack([image_array(seen.image) for seen in observations]))
         return [choose(mine, GREEDY, draw)[0] for mine, draw in zip(values, draws, strict=True)]
-
-    return chosen
-
-
-def each(choose_one: Callable[[Observation, np.random.Generator], int]) -> Chooser:
-    """Ask for one robot after the other."""
-
-    def chosen(
-        observations: Sequence[Observation], draws: Sequence[np.random.Generator]
-    ) -> list[int]:
-        return [choose_one(seen, draw) for seen, draw in zip(observations, draws, strict=True)]
 
     return chosen
 

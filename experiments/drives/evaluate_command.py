@@ -1,9 +1,6 @@
 """`corridor evaluate`: what the network of a run can do, beside planner and random actions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
-from math import isfinite
 from pathlib import Path
 
 from rich.console import Console
@@ -12,7 +9,6 @@ from rich.table import Table
 from experiments.drives import routes
 from experiments.drives.choosers import Chooser, Planned, greedy, side_by_side, uniform
 from experiments.drives.frozen_drives import evaluate
-from experiments.drives.predictions import prediction_figures
 from experiments.drives.traces import Figures
 from experiments.environment import CorridorEnv
 from experiments.records import EVALUATION_COLUMNS
@@ -35,32 +31,20 @@ SHOWN = {
     "coverage": "free cells visited",
     "circling": "actions spent circling",
 }
-PREDICTED = {
-    "wall_value": "prediction of actions that hit a wall within 6 actions",
-    "value_rank": "rank correlation of predictions with observed rewards",
-    "value_slope": "slope of observed rewards over predictions",
-}
-"""Figures of the network alone, on drives that explore."""
 SHARES = ("distance", "coverage", "circling")
 
 
 def run(path: Path, config: Config, starts: int, actions: int, out: Path) -> None:
     """Evaluate in the configured world; print a table, write `evaluation.csv`, routes and pictures.
 
-    Args:
-        path: Folder of a run, or a file of weights.
-        config: World, robot and shape of the network.
-        starts: Number of drives.
-        actions: Of each drive.
-        out: Folder, made if missing.
+    path: The folder of a run, or a file of weights.
 
     Raises:
         ConfigError: No such run, no such world, another shape of network, or an unwritable folder.
         StateError: The network's file is damaged.
     """
     weights = frozen.read(frozen.find(path))
-    predictor = weights.predictor(config.network, side_by_side(ActorNumerics()))
-    network = greedy(predictor)
+    network = greedy(weights.predictor(config.network, side_by_side(ActorNumerics())))
     try:
         env = CorridorEnv(config=config)
     except WorldError as error:
@@ -71,8 +55,6 @@ def run(path: Path, config: Config, starts: int, actions: int, out: Path) -> Non
             ("planner", lambda: Planned(env.world, config.robot)),
         )  # fmt: skip
         found = {name: _drive(env, make, starts, actions, name, out) for name, make in drivers}
-        judged = prediction_figures(env, predictor, starts, actions)
-        found["network"] |= {name: value for name, value in judged.items() if isfinite(value)}
     finally:
         env.close()
     rows = [_row(name, config, weights, figures) for name, figures in found.items()]
@@ -87,9 +69,8 @@ def table(world: str, found: Mapping[str, Figures]) -> Table:
     shown.add_column("figure")
     for driver in found:
         shown.add_column(driver, justify="right")
-    for name, text in (SHOWN | PREDICTED).items():
-        told = (_text(name, each[name]) if name in each else "-" for each in found.values())
-        shown.add_row(text, *told)
+    for name, text in SHOWN.items():
+        shown.add_row(text, *(_text(name, each[name]) for each in found.values()))
     return shown
 
 
@@ -104,7 +85,8 @@ def _drive(
     try:
         out.mkdir(parents=True, exist_ok=True)
         routes.write(out / f"route-{name}.npz", routes.Route(done.traces[0]))
-        routes.draw(out / f"routes-{name}.png", env.world, done.traces, title)
+        picture = routes.figure(env.world, done.traces, title)
+        picture.savefig(out / f"routes-{name}.png", format="png")
     except OSError as error:
         raise ConfigError(f"{out}: cannot be written: {error.strerror}") from error
     return done.figures

@@ -2,25 +2,27 @@
 
 The robots drive side by side, so that the network predicts for many of them at once. It is frozen
 and acts greedily. `planner` and `random` drive through the same code and are the ceiling and the
-floor.
+floor. They depend on world, robot and starts alone: they are driven once and kept beside the runs.
 """
 
-from __future__ import annotations
-
+import hashlib
+import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from experiments.drives.choosers import Chooser
+from experiments.drives.choosers import Chooser, Planned, uniform
 from experiments.drives.places import SEED, first_start, free_cells, start_poses
 from experiments.drives.traces import Figures, Trace, figures
 from experiments.environment import CorridorEnv
 from services.robot_driver.robot import Pose
 from shared.messages import Observation
 from shared.rl.draws import generator
+from shared.statefile import write_atomically
 
 STARTS, ACTIONS = 16, 400
 """How many drives, and of how many actions each, unless told otherwise."""
@@ -57,22 +59,15 @@ def drive_from_first_start(env: CorridorEnv, choose: Chooser, actions: int = ACT
 
 
 def drive(env: CorridorEnv, choose: Chooser, poses: Sequence[Pose], actions: int) -> list[Trace]:
-    """Drive from several poses side by side, as if each robot were the only one.
+    """Drive from several poses side by side, as if each robot were the only one; a trace for each.
 
     The robots act in turn, in one scene, and none is in another's way. What one does depends only
-    on its pose, its number among the poses, which seeds its draws, and who drives.
+    on its pose, its number among the poses, which seeds its draws, and who drives. After a bump the
+    driver recovers as always.
 
-    Args:
-        env: Without a wrapper. Its own robot drives from the first pose, twins from the others.
-        choose: Who drives.
-        poses: Where to begin, standing.
-        actions: How many from each pose, at least 1. After a bump the driver recovers as always.
+    env: Without a wrapper. Its own robot drives from the first pose, twins from the others.
 
-    Returns:
-        A trace for each pose.
-
-    Raises:
-        ValueError: A pose is inside a wall.
+    Raises ValueError for a pose inside a wall.
     """
     with ExitStack() as twins:
         drives: list[Drive] = []
@@ -133,3 +128,31 @@ class Drive:
             laps_left=laps.left,
             laps_right=laps.right,
         )
+
+
+_CHOOSERS: dict[str, Callable[[CorridorEnv], Chooser]] = {
+    "random": lambda _: uniform,
+    "planner": lambda env: Planned(env.robot.world, env.config.robot),
+}
+DRIVERS = tuple(_CHOOSERS)
+
+
+def reference(env: CorridorEnv, driver: str, starts: int, actions: int, kept: Path) -> Figures:
+    """Figures of a driver that learns nothing, from the folder `kept` where they are known."""
+    path = kept / f"{driver}-{env.robot.world.name}-{_key(env, starts, actions)}.json"
+    if path.is_file():
+        return {str(key): float(value) for key, value in json.loads(path.read_text()).items()}
+    figures = evaluate(env, _CHOOSERS[driver](env), starts, actions).figures
+    write_atomically(path, json.dumps(figures).encode())
+    return figures
+
+
+def _key(env: CorridorEnv, starts: int, actions: int) -> str:
+    """8 hex digits over everything that decides the figures."""
+    decides = {
+        "robot": env.config.robot.model_dump(mode="json"),
+        "horizon": env.config.episode.horizon,
+        "world": env.robot.world.fingerprint,
+        "drives": [starts, actions],
+    }
+    return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:8]

@@ -1,7 +1,5 @@
 """Where a robot can be in a world: free cells to be covered, poses to start from."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -53,11 +51,7 @@ def free_cells(world: World, radius_m: float) -> Cells:
 
 
 def reachable(world: World, radius_m: float) -> Floats:
-    """Grid points float64 [n, 2] where a robot fits and to which a way leads from a start.
-
-    Raises:
-        ValueError: It fits at none of the starts.
-    """
+    """Grid points float64 [n, 2] where a robot fits, reached from a start; or ValueError."""
     x0, y0, x1, y1 = world.bounds
     columns, rows = int((x1 - x0) / GRID_M), int((y1 - y0) / GRID_M)
     y, x = (np.mgrid[0:rows, 0:columns] + 0.5) * GRID_M

@@ -1,12 +1,11 @@
 """The way of drives: on disk, and drawn on the top view of their world."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,8 +32,7 @@ _BUMP, _START, _END = "#d55e00", "#009e73", "#282c34"
 _WAY = "#0072b2"
 
 
-@dataclass(frozen=True)
-class Event:
+class Event(NamedTuple):
     """Something worth telling that happened on a drive."""
 
     number: int
@@ -43,8 +41,7 @@ class Event:
     text: str
 
 
-@dataclass(frozen=True)
-class Route:
+class Route(NamedTuple):
     """One drive with its events."""
 
     trace: Trace
@@ -62,7 +59,7 @@ def write(path: Path, route: Route) -> None:
         headings_rad=trace.headings_rad,
         way_m=trace.way_m,
         laps=np.array([trace.laps_left, trace.laps_right]),
-        events=np.array(json.dumps([event.__dict__ for event in route.events])),
+        events=np.array(json.dumps([event._asdict() for event in route.events])),
     )
 
 
@@ -90,21 +87,12 @@ def read(path: Path) -> Route:
     return Route(trace, events)
 
 
-def draw(path: Path, world: World, traces: Sequence[Trace], title: str) -> None:
-    """The same as `figure`, written to a PNG file."""
-    figure(world, traces, title).savefig(path, format="png")
-
-
 def figure(
     world: World, traces: Sequence[Trace], title: str, events: Sequence[Event] = ()
 ) -> Figure:
     """Drives on the top view of their world: ways, starts, ends and bumps (Fig 4.20).
 
-    Args:
-        world: Where they drove.
-        traces: At least one.
-        title: What stands above.
-        events: Of the first drive; their numbers stand beside the way.
+    The events are those of the first drive; their numbers stand beside the way.
     """
     sheet, (x0, y0, x1, y1) = Figure(dpi=DPI, layout="constrained"), world.bounds
     sheet.set_size_inches(WIDTH_IN, WIDTH_IN * (y1 - y0) / (x1 - x0) + LEGEND_IN)
@@ -199,16 +187,16 @@ def _driven(trace: Trace) -> list[npt.NDArray[np.float64]]:
 def _legend(
     traces: Sequence[Trace], marks: Sequence[tuple[npt.NDArray[np.float64], str, str, str]]
 ) -> list[Line2D]:
+    def counted(count: int, name: str) -> str:
+        return f"{count} {name}{'' if count == 1 else 's'}"
+
     actions = sum(len(trace.bumps) for trace in traces)
-    drives = "1 drive" if len(traces) == 1 else f"{len(traces)} drives"
-    handles = [Line2D([], [], color=_WAY, label=f"{drives}, {actions} actions")]
-    for places, marker, colour, name in marks:
-        label = f"{len(places)} {name}{'' if len(places) == 1 else 's'}"
-        handles.append(
-            Line2D([], [], color=colour, marker=marker, linestyle="", label=label,
-                   markeredgewidth=1.6)
-        )  # fmt: skip
-    return handles
+    label = f"{counted(len(traces), 'drive')}, {actions} actions"
+    mark = partial(Line2D, [], [], linestyle="", markeredgewidth=1.6)
+    return [
+        Line2D([], [], color=_WAY, label=label),
+        *(mark(color=c, marker=m, label=counted(len(at), name)) for at, m, c, name in marks),
+    ]
 
 
 def _scale_bar(figure: Figure, world: World) -> None:

@@ -5,8 +5,6 @@ nothing good (`shared.rl.spot_turns`). At a junction towards the end a box is dr
 the robot.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -21,6 +19,7 @@ from experiments.records import TourRecord
 from services.robot_driver.robot import Pose
 from services.robot_driver.simulated.world import World
 from services.robot_driver.simulated.world_parts import Place
+from services.robot_driver.simulated.world_parts import Route as Line
 from shared.config import PolicyConfig
 from shared.messages import Box, WorldChange, image_array
 from shared.rl.draws import generator
@@ -65,6 +64,7 @@ class _TestDrive:
         self, env: CorridorEnv, network: Predicts, pose: Pose, number: int, policy: PolicyConfig
     ) -> None:
         self._env, self._network, self._policy = env, network, policy
+        self._world, self._route = env.robot.world, _route(env.robot.world)
         self._drive = Drive(env, number, pose)
         self._draw = generator(number, ROLE)
         self._spot_turns = SpotTurns(env.config.robot.turn_rad_s * env.config.robot.period_s)
@@ -93,15 +93,16 @@ class _TestDrive:
         """Whether the tour is full, in actions, route and bridges, and is past the box."""
         if self._dropped_at is None or self.driven < max(DRIVEN, self._dropped_at + BEYOND_BOX):
             return False
-        world, places_m = self._env.robot.world, self._drive.trace().places_m
-        bridges = _bridges(world, places_m)
-        return len(bridges) >= BRIDGES and route_share(world, places_m) >= ROUTE_SHARE
+        places_m = self._drive.trace().places_m
+        enough = len(_bridges(self._route, places_m)) >= BRIDGES
+        return enough and route_share(self._world, places_m) >= ROUTE_SHARE
 
     def drop_box_if_due(self) -> None:
         """Drop the box across the robot's way, at a junction towards the end, if there is room."""
         pose = self._env.robot.pose
         due = self._dropped_at is None and self.driven >= DROP_AFTER
-        if not due or not _at_junction(self._env.robot.world, pose):
+        junctions = (place for place in self._route.places if place.kind == "junction")
+        if not due or not any(_apart_m(place, pose) <= NEAR_M for place in junctions):
             return
         wish = WorldChange(kind="place", box=_box_ahead(pose))
         if self._env.driver.change(wish, at_once=True).accepted:
@@ -111,11 +112,9 @@ class _TestDrive:
 
     def tell_passed(self) -> None:
         """Note named places the first time the robot comes past them."""
-        route = self._env.robot.world.route
-        assert route is not None
         here = self._env.robot.pose
         told = {event.text for event in self._events}
-        for place in route.places:
+        for place in self._route.places:
             text = f"at {place.name}"
             if text not in told and _apart_m(place, here) <= NEAR_M / 2:
                 self._tell(text, len(self._drive.bumps))
@@ -125,14 +124,14 @@ class _TestDrive:
         dropped = self._dropped_at is not None
         if dropped:
             self._env.robot.remove(BOX_NAME)
-        world, trace = self._env.robot.world, self._drive.trace()
+        trace = self._drive.trace()
         told = TourRecord(
             passed=False,
             driven=self.driven,
             turned=self.turned,
             bumps=sum(self._drive.bumps),
-            route_share=round(route_share(world, trace.places_m), 4),
-            bridges=_bridges(world, trace.places_m),
+            route_share=round(route_share(self._world, trace.places_m), 4),
+            bridges=_bridges(self._route, trace.places_m),
             box_dropped=dropped,
         )
         told = told.model_copy(update={"passed": passes(told)})
@@ -164,9 +163,6 @@ def drive_tour(
     Raises:
         ValueError: The world has no route, or the pose is inside a wall.
     """
-    world = env.robot.world
-    if world.route is None:
-        raise ValueError(f"world {world.name!r} has no route")
     drive = _TestDrive(env, network, pose, number, policy)
     while drive.driven < most_driven and drive.driven + drive.turned < 4 * most_driven:
         drive.tell_passed()
@@ -179,26 +175,24 @@ def drive_tour(
 
 def route_share(world: World, places_m: npt.NDArray[np.float64], near_m: float = NEAR_M) -> float:
     """Part of the route's length along which the robot came, places float64 [n, 2]."""
-    assert world.route is not None
-    line = world.route.sample(0.1)
+    line = _route(world).sample(0.1)
     gaps = np.hypot(*(line[:, None] - places_m[None]).transpose(2, 0, 1)).min(axis=1)
     return float(np.mean(gaps <= near_m))
 
 
-def _bridges(world: World, places_m: npt.NDArray[np.float64]) -> tuple[str, ...]:
-    assert world.route is not None
+def _route(world: World) -> Line:
+    if world.route is None:
+        raise ValueError(f"world {world.name!r} has no route")
+    return world.route
+
+
+def _bridges(route: Line, places_m: npt.NDArray[np.float64]) -> tuple[str, ...]:
     return tuple(
         place.name
-        for place in world.route.places
+        for place in route.places
         if place.kind == "bridge"
         and np.hypot(*(places_m - (place.x_m, place.y_m)).T).min() <= NEAR_M
     )
-
-
-def _at_junction(world: World, pose: Pose) -> bool:
-    assert world.route is not None
-    junctions = (place for place in world.route.places if place.kind == "junction")
-    return any(_apart_m(place, pose) <= NEAR_M for place in junctions)
 
 
 def _apart_m(place: Place, pose: Pose) -> float:

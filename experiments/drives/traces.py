@@ -4,8 +4,6 @@ Circling on the spot bumps into nothing. That is why bumps never stand alone her
 where the robot was, laps, coverage and circling tell whether it gets anywhere.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -119,10 +117,7 @@ def circling(trace: Trace, horizon: int, max_distance_m: float) -> Bools:
 def first_lap(trace: Trace, world: World) -> int | None:
     """Actions after which a drive has gone once round the lap centre, either way round.
 
-    None if it never does, or not before its first bump.
-
-    Raises:
-        ValueError: The world has no lap centre.
+    None if it never does, or not before its first bump. Raises ValueError without a lap centre.
     """
     if world.lap is None:
         raise ValueError(f"world {world.name!r} has no lap centre")

@@ -6,8 +6,6 @@ it. `full` has the exact constants, computed on a GPU where there is one. What s
 of a plan is the business of `scales`.
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Iterable, Mapping
 from importlib import resources
@@ -115,20 +113,12 @@ def plan_names(folder: Traversable = PLANS) -> list[str]:
 
 
 def full_plan(name: str, folder: Traversable = PLANS) -> Plan:
-    """The plan of this name, as its file says it.
-
-    Raises:
-        ConfigError: There is none of that name, or its file is wrong.
-    """
+    """The plan of this name, as its file says it. Raises ConfigError: none, or a wrong one."""
     return read_plan(name, _text_of(name, folder), folder)
 
 
 def presentations(names: Iterable[str], folder: Traversable = PLANS) -> dict[str, Presentation]:
-    """How reports show experiments, by name. An experiment without a plan has the defaults.
-
-    Raises:
-        ConfigError: A plan is wrong.
-    """
+    """How reports show experiments, by name; without a plan as by default. Raises ConfigError."""
     known = plan_names(folder)
     return {
         name: full_plan(name, folder).report if name in known else Presentation() for name in names
@@ -136,11 +126,7 @@ def presentations(names: Iterable[str], folder: Traversable = PLANS) -> dict[str
 
 
 def read_plan(name: str, text: str, folder: Traversable = PLANS) -> Plan:
-    """The plan in the text of a file; `folder` has the plans it may be `like`.
-
-    Raises:
-        ConfigError: The text is wrong.
-    """
+    """The plan in the text of a file; `folder` has those it may be `like`. Raises ConfigError."""
     try:
         plan = Plan.model_validate({"name": name, **_tree((name,), text, folder)})
     except ValidationError as error:
@@ -189,10 +175,7 @@ def _text_of(name: str, folder: Traversable) -> str:
 def _tree(names: tuple[str, ...], text: str, folder: Traversable) -> Tree:
     """The tables of a plan, laid over those of the one it is `like`; lists are replaced.
 
-    Args:
-        names: The plan, after the plans that are like it.
-        text: Its file.
-        folder: All plans.
+    names: The plan, after the plans that are like it.
     """
     try:
         tree = tomllib.loads(text)

@@ -4,8 +4,6 @@ Reports know no experiment by name. What is shown together, what is compared wit
 the thesis lets one expect stands in the plans.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -93,8 +91,6 @@ class Presentation(Section):
     """Groups in which all others are compared with this experiment only."""
     table: Literal["", "fitness"] = ""
     """The table that this experiment has a row in."""
-    full_scale: bool = True
-    """Whether the plan is meant for the full scale, and its cost there is told."""
     figures: dict[str, str] = Field(default_factory=dict)
     """The figure of the thesis by the kind of ours: fitness, loss, memory, worlds, route, table,
     `probes-best-<world>`, `probes-last-<world>`."""
@@ -102,5 +98,5 @@ class Presentation(Section):
     claims: Annotated[tuple[Claim, ...], Field(strict=False)] = ()
 
 
-INHERITED = ("groups", "table", "full_scale")
+INHERITED = ("groups", "table")
 """What a plan takes over from the one that it is `like`; the rest tells of one experiment only."""

@@ -4,8 +4,6 @@ A smaller experiment is a model of the large one where these numbers agree. Acti
 memories: N actions renew a memory once.
 """
 
-from __future__ import annotations
-
 from experiments.plans.plan import Plan, full_plan, stage_config
 from experiments.plans.scales import LEAST_CAPACITY, divisor_of, episode_actions, scaled
 from shared.config import Config
@@ -27,10 +25,7 @@ SMALL_MEMORY = f"a memory holds at least {LEAST_CAPACITY} samples, one long epis
 def numbers(plan: Plan, index: int, length: float) -> Numbers:
     """The numbers of a stage; those of what the stage does not do are left out.
 
-    Args:
-        plan: The plan at its scale.
-        index: Which of its stages.
-        length: Mean actions of an episode.
+    length: Mean actions of an episode.
     """
     config = stage_config(plan, index, seed=1)
     memory, learning = config.memory, config.learning
@@ -99,11 +94,7 @@ def description(name: str, scale: str) -> str:
 def _steps(config: Config, actions: float, fits: float, length: float) -> float:
     """Gradient steps of this many actions, on average.
 
-    Args:
-        config: The configuration.
-        actions: How many.
-        fits: Actions between fitting phases; 0: there are none.
-        length: Mean actions of an episode.
+    fits: Actions between fitting phases; 0: there are none. length: Mean actions of an episode.
     """
     learning = config.learning
     steps = learning.mini_batches_per_episode / length

@@ -5,8 +5,6 @@ in episodes is counted in actions there, since the length of episodes depends on
 memory is renewed, equalised and learnt from as often as in the thesis.
 """
 
-from __future__ import annotations
-
 from importlib.resources.abc import Traversable
 from typing import NamedTuple
 
@@ -49,11 +47,7 @@ _PERIODS = (("memory", "equalise_every"), ("learning", "fit_every"))
 
 
 def load_plan(name: str, scale: str, folder: Traversable = PLANS) -> Plan:
-    """The plan of this name at a scale.
-
-    Raises:
-        ConfigError: There is no plan or no scale of that name, or the plan's file is wrong.
-    """
+    """The plan of this name at a scale. Raises ConfigError: there is none, or its file is wrong."""
     return scaled(full_plan(name, folder), scale)
 
 
@@ -120,12 +114,9 @@ def _with_defaults(config: Tree) -> Tree:
 
 
 def _divided(config: Tree, length: float, divisor: int) -> Tree:
-    """Settings with smaller memories, and with periods in actions.
+    """Differences to a configuration, with smaller memories, and with periods in actions.
 
-    Args:
-        config: Differences to a configuration.
-        length: Mean actions of an episode.
-        divisor: What to divide by.
+    length: Mean actions of an episode.
     """
     result = merged({}, config)
     memory = config.get("memory", {})

@@ -4,8 +4,6 @@ An archive is a tar file compressed with xz. Its members are called `seed-<n>/<f
 those that a run writes (`experiments/records.py`).
 """
 
-from __future__ import annotations
-
 import io
 import lzma
 import re
@@ -33,11 +31,8 @@ Files = Mapping[str, bytes]
 def keep(runs: Sequence[Path], folder: Path, *, arrays: bool) -> None:
     """Add runs to the archives of their experiments. A seed that is there already is replaced.
 
-    Args:
-        runs: Folders of seeds, of experiments, or of several experiments.
-        folder: The folder of the archives. It is made if it is missing.
-        arrays: Whether predictions and routes of the lowest seed are kept as well. Figures of
-            images and of drives need them; they take most of an archive's size.
+    arrays: Whether predictions and routes of the lowest seed are kept as well. Figures of images
+        and of drives need them; they take most of an archive's size.
 
     Raises:
         ConfigError: A folder holds no run, or the archives would be larger than KEPT_BYTES.
@@ -111,11 +106,7 @@ def read(path: Path) -> Files:
 
 
 def load(paths: Iterable[Path]) -> list[Experiment]:
-    """The experiments of archives, as `run_folder.load` gives them.
-
-    Raises:
-        StateError: An archive or a run in it is damaged.
-    """
+    """The experiments of archives, as `run_folder.load` gives them. Raises StateError: damaged."""
     with TemporaryDirectory(prefix="corridor-results-") as temporary:
         folders = []
         for path in paths:

@@ -6,9 +6,7 @@ surely does not: the whole 95 % interval (Wilson) of the share of seeds lies on 
 That takes at least four seeds that agree.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from math import inf, isfinite
 
 import numpy as np
@@ -31,6 +29,21 @@ from shared.facts import SHORT_NAMES
 
 Runs = Mapping[str, Experiment]
 """Experiments of one scale by name."""
+HEADER = ("claim", "where", "verdict", "seeds in which it holds", "figure", "command")
+TOLD = {
+    "bumps-beside": "bumps divided by those of the other",
+    "rarer-direction": "laps per 1,000 actions in the rarer direction",
+    "unbalance": "largest minus smallest share of an action in the memory",
+    "lowest-fitness": "lowest mean fitness as a part of the median",
+    "kept": "way between bumps, after the other corridor over before",
+    "samples-beside": "samples of the first corridor for each of the second",
+    "highest-threshold": "highest threshold (%)",
+    "highest-capacity": "highest capacity, as large as in the thesis",
+    "clean-tours": "test drives that were full and without a bump",
+    "fitness-beside": "highest mean fitness over that of the lowest other",
+    "loss-after-fit": "loss after the first fit over before",
+}
+"""What the figure of a seed is called."""
 
 
 def claims_sections(
@@ -44,10 +57,8 @@ def claims_sections(
             _row(claim, runs[name], runs) for name in sorted(runs) for claim in shown[name].claims
         ]
         if rows:
-            header = ("claim", "where", "verdict", "seeds in which it holds", "figure", "command")
-            title = f"Claims of the thesis at scale {scale}"
-            table = Table(f"claims-{scale}", title, header, tuple(rows))
-            sections.append(Section(f"claims-{scale}", title, (table,)))
+            name, title = f"claims-{scale}", f"Claims of the thesis at scale {scale}"
+            sections.append(Section(name, title, (Table(name, title, HEADER, tuple(rows)),)))
     return sections
 
 
@@ -68,9 +79,9 @@ def holds(claim: Claim, value: float) -> bool:
 
 
 def _row(claim: Claim, experiment: Experiment, runs: Runs) -> tuple[str, ...]:
-    text, measure = _FIGURES[claim.figure]
-    found = (measure(run, claim, runs) for run in experiment.runs)
+    found = (_figure(claim, run, runs) for run in experiment.runs)
     values = np.array([value for value in found if isfinite(value)], np.float64)
+    text = TOLD[claim.figure]
     return (
         claim.text,
         claim.source,
@@ -80,54 +91,46 @@ def _row(claim: Claim, experiment: Experiment, runs: Runs) -> tuple[str, ...]:
     )
 
 
-# ---------------------------------------------------------------- figures of a seed
+def _figure(claim: Claim, run: RunFolder, runs: Runs) -> float:
+    """The figure of a seed. NaN: it is not known."""
+    others = (each for name in claim.others if name in runs for each in runs[name].runs)
+    beside = [each for each in others if each.info.seed == run.info.seed]
+    match claim.figure:
+        case "bumps-beside":
+            rates = [_at_end(each, claim, "bumps") + 0.5 for each in (run, *beside)]
+            return rates[0] / rates[1] if len(rates) == 2 else MISSING
+        case "rarer-direction":
+            sides = ("laps_left_per_1000", "laps_right_per_1000")
+            return min(_at_end(run, claim, side) for side in sides)
+        case "lowest-fitness":
+            curve = curve_of(run, "fitness")[1]
+            return float(curve.min() / np.median(curve)) if len(curve) else MISSING
+        case "kept":
+            found = kept(run, claim.worlds[0], None)
+            return found.share if found else MISSING
+        case "clean-tours":
+            return float(sum(tour.passed for tour in run.tours)) if run.tours else MISSING
+        case "fitness-beside":
+            complete = len(beside) == len(claim.others)
+            lowest = min(map(max_mean_fitness, beside)) if complete else MISSING
+            return max_mean_fitness(run) / lowest
+        case "loss-after-fit":
+            return loss_ratio(run)
+        case _:
+            return _of_memory(claim, run) if run.info.complete else MISSING
 
 
-def _bumps_beside(run: RunFolder, claim: Claim, runs: Runs) -> float:
-    rates = [_at_end(each, claim, "bumps") + 0.5 for each in (run, *_beside(run, claim, runs))]
-    return rates[0] / rates[1] if len(rates) == 2 else MISSING
-
-
-def _rarer_direction(run: RunFolder, claim: Claim, _: Runs) -> float:
-    sides = ("laps_left_per_1000", "laps_right_per_1000")
-    return min(_at_end(run, claim, side) for side in sides)
-
-
-def _unbalance(run: RunFolder, _: Claim, __: Runs) -> float:
+def _of_memory(claim: Claim, run: RunFolder) -> float:
+    """A figure of the memory, which is known of a complete run only."""
+    if claim.figure == "highest-threshold":
+        return highest(run, "threshold_percent")
+    if claim.figure == "highest-capacity":
+        return highest(run, "capacity") * run.info.factor
+    if claim.figure == "samples-beside":
+        ours, theirs = (run.samples_by_world.get(name, [MISSING])[-1] for name in claim.worlds)
+        return float(ours / max(theirs, 1.0))
     counts = np.array([run.episodes.numbers(name)[-1:] for name in SHORT_NAMES], np.float64)
-    told = run.info.complete and counts.size and np.all(np.isfinite(counts))
-    return float(np.ptp(counts) / counts.sum()) if told else MISSING
-
-
-def _lowest_fitness(run: RunFolder, _: Claim, __: Runs) -> float:
-    curve = curve_of(run, "fitness")[1]
-    return float(curve.min() / np.median(curve)) if len(curve) else MISSING
-
-
-def _kept(run: RunFolder, claim: Claim, _: Runs) -> float:
-    found = kept(run, claim.worlds[0], None)
-    return found.share if found else MISSING
-
-
-def _samples_beside(run: RunFolder, claim: Claim, _: Runs) -> float:
-    counts = [run.samples_by_world[name] for name in claim.worlds if name in run.samples_by_world]
-    if not run.info.complete or len(counts) < 2:
-        return MISSING
-    return float(counts[0][-1] / max(counts[1][-1], 1.0))
-
-
-def _highest(run: RunFolder, column: str) -> float:
-    return highest(run, column) if run.info.complete else MISSING
-
-
-def _clean_tours(run: RunFolder, _: Claim, __: Runs) -> float:
-    return float(sum(tour.passed for tour in run.tours)) if run.tours else MISSING
-
-
-def _fitness_beside(run: RunFolder, claim: Claim, runs: Runs) -> float:
-    others = [max_mean_fitness(each) for each in _beside(run, claim, runs)]
-    complete = len(others) == len(claim.others)
-    return max_mean_fitness(run) / min(others) if complete else MISSING
+    return float(np.ptp(counts) / counts.sum()) if counts.size else MISSING
 
 
 def _at_end(run: RunFolder, claim: Claim, column: str) -> float:
@@ -136,30 +139,3 @@ def _at_end(run: RunFolder, claim: Claim, column: str) -> float:
     if claim.stage:
         rows = rows.where(label=f"stage {claim.stage}")
     return float(rows.numbers(column)[-1]) if len(rows) else MISSING
-
-
-def _beside(run: RunFolder, claim: Claim, runs: Runs) -> list[RunFolder]:
-    """The runs of the other experiments with the same seed."""
-    others = (each for name in claim.others if name in runs for each in runs[name].runs)
-    return [each for each in others if each.info.seed == run.info.seed]
-
-
-_FIGURES: Mapping[str, tuple[str, Callable[[RunFolder, Claim, Runs], float]]] = {
-    "bumps-beside": ("bumps divided by those of the other", _bumps_beside),
-    "rarer-direction": ("laps per 1,000 actions in the rarer direction", _rarer_direction),
-    "unbalance": ("largest minus smallest share of an action in the memory", _unbalance),
-    "lowest-fitness": ("lowest mean fitness as a part of the median", _lowest_fitness),
-    "kept": ("way between bumps, after the other corridor over before", _kept),
-    "samples-beside": ("samples of the first corridor for each of the second", _samples_beside),
-    "highest-threshold": (
-        "highest threshold (%)", lambda run, _, __: _highest(run, "threshold_percent"),
-    ),
-    "highest-capacity": (
-        "highest capacity, as large as in the thesis",
-        lambda run, _, __: _highest(run, "capacity") * run.info.factor,
-    ),
-    "clean-tours": ("test drives that were full and without a bump", _clean_tours),
-    "fitness-beside": ("highest mean fitness over that of the lowest other", _fitness_beside),
-    "loss-after-fit": ("loss after the first fit over before", lambda run, _, __: loss_ratio(run)),
-}  # fmt: skip
-"""What the figure of a seed is called, and how it is found. NaN: it is not known."""

@@ -1,7 +1,5 @@
 """A page of figures, tables and sentences, written as Markdown or as one HTML file."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -90,19 +88,8 @@ def write_pictures(sections: Sequence[Section], folder: Path) -> None:
                 (folder / f"{block.name}.png").write_bytes(block.image)
 
 
-def sentences(found: Sequence[str]) -> list[Block]:
-    """A block of sentences; none where nothing was found."""
-    return [Findings(tuple(found))] if found else []
-
-
 def markdown(sections: Sequence[Section], images: str, level: int = 2) -> str:
-    """Sections as Markdown.
-
-    Args:
-        sections: What to write.
-        images: Path of the folder with the pictures, as seen from the page.
-        level: Of the sections' headings.
-    """
+    """Sections as Markdown, with headings of this level; `images`: as in `block_text`."""
     parts = []
     for section in sections:
         parts.append(f"{'#' * level} {section.title}")

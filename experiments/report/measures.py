@@ -1,11 +1,9 @@
 """Single numbers of runs, and how they are written."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import dropwhile, takewhile
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,23 +11,18 @@ from experiments.drives.traces import FULL_RUN
 from experiments.report.figures.drives import LAPS
 from experiments.report.figures.progress import curve_of
 from experiments.report.run_folder import Experiment, Floats, Rows, RunFolder
-from shared.run_record import RunInfo
 
 MISSING = float("nan")
+Of = Callable[[RunFolder], float]
 
 
-@dataclass(frozen=True)
-class Measure:
+class Measure(NamedTuple):
     """A number of a run that the thesis tells as well."""
 
     text: str
-    of: Callable[[RunFolder], float]
+    of: Of
     grows: bool = False
     """Whether it grows with the scale."""
-
-    def scaled(self, value: float, info: RunInfo) -> float:
-        """A number of the thesis at the scale of a run."""
-        return value / info.factor if self.grows else value
 
 
 def highest(run: RunFolder, column: str) -> float:
@@ -53,32 +46,30 @@ def loss_ratio(run: RunFolder) -> float:
     return float(np.median(after) / before[0]) if len(before) and len(after) else MISSING
 
 
-def longest_run_episode(run: RunFolder) -> float:
-    """Episode in which the longest way without a bump got its full length."""
-    lengths = run.runs_without_bump
-    return float(run.episodes.numbers("episode")[np.argmax(lengths)]) if len(lengths) else MISSING
-
-
 def longest_run(run: RunFolder) -> float:
     """Most actions without a bump in the run's own episodes."""
     return float(np.max(run.runs_without_bump)) if len(run.episodes) else MISSING
 
 
-def actions_per_episode(run: RunFolder) -> float:
-    """Mean of all episodes."""
-    return run.actions / len(run.episodes) if len(run.episodes) else MISSING
+def _longest_run_episode(run: RunFolder) -> float:
+    """Episode in which the longest way without a bump got its full length."""
+    lengths = run.runs_without_bump
+    return float(run.episodes.numbers("episode")[np.argmax(lengths)]) if len(lengths) else MISSING
 
 
 MEASURED = {
     "episodes": Measure("episodes", lambda run: float(len(run.episodes)), grows=True),
     "actions": Measure("actions", lambda run: float(run.actions), grows=True),
-    "actions_per_episode": Measure("actions per episode", actions_per_episode),
+    "actions_per_episode": Measure(
+        "actions per episode",
+        lambda run: run.actions / len(run.episodes) if len(run.episodes) else MISSING,
+    ),
     "capacity": Measure(
         "largest capacity of the memory", lambda run: highest(run, "capacity"), grows=True
     ),
     "longest_run": Measure("most actions without a bump", longest_run, grows=True),
     "longest_run_episode": Measure(
-        "episode of the longest way without a bump", longest_run_episode, grows=True
+        "episode of the longest way without a bump", _longest_run_episode, grows=True
     ),
     "fitness": Measure("highest mean fitness", max_mean_fitness),
     "max_threshold_percent": Measure(
@@ -88,30 +79,24 @@ MEASURED = {
 """What stands in `thesis` of run.json under these names is shown beside ours (E37)."""
 
 
-def of_seeds(experiment: Experiment, measure: Callable[[RunFolder], float]) -> Floats:
+def of_seeds(experiment: Experiment, measure: Of) -> Floats:
     """One number per seed, float64 [seeds], without those that have none."""
     values = np.array([measure(run) for run in experiment.runs], np.float64)
     return values[np.isfinite(values)]
 
 
-def newest(run: RunFolder, world: str, driver: str = "network") -> Rows:
-    """The last drive of a driver in a world, one row or none."""
-    return Rows(run.evaluations.where(driver=driver, world=world).rows[-1:])
-
-
-def evaluated(column: str, world: str, driver: str = "network") -> Callable[[RunFolder], float]:
+def evaluated(column: str, world: str, driver: str = "network") -> Of:
     """A figure of the newest drive; `laps` counts both directions."""
 
     def measure(run: RunFolder) -> float:
-        rows = newest(run, world, driver)
+        rows = Rows(run.evaluations.where(driver=driver, world=world).rows[-1:])
         values = LAPS.of(rows) if column == "laps" else rows.numbers(column)
         return float(values[0]) if len(values) else MISSING
 
     return measure
 
 
-@dataclass(frozen=True)
-class Kept:
+class Kept(NamedTuple):
     """Mean way between two bumps in a world before and after learning another one, in actions."""
 
     seed: int
@@ -125,29 +110,20 @@ class Kept:
 
 
 def kept(run: RunFolder, world: str, start: RunFolder | None) -> Kept | None:
-    """How much of one world is left after the first stages in others.
+    """How much of one world is left after the first stages in others; None: it did not drive there.
 
-    Args:
-        run: It learned elsewhere for one stage or more.
-        world: The one it could drive in before.
-        start: The run it goes on from, looked at if `run` did not drive before those stages.
-
-    Returns:
-        None where one of the two drives is missing.
+    start: The run it goes on from, looked at if `run` did not drive before those stages.
     """
-    stages = run.info.stages
-    away = list(
-        takewhile(lambda s: s.world != world, dropwhile(lambda s: s.world == world, stages))
-    )
+    here = dropwhile(lambda stage: stage.world == world, run.info.stages)
+    away = list(takewhile(lambda stage: stage.world != world, here))
     if not away or away[-1].last_episode is None:
         return None
-    first, last = away[0].first_episode, away[-1].last_episode
     rows = run.evaluated(world)
     episodes, ways = rows.numbers("episode"), ways_between_bumps(rows)
-    before = ways[episodes < first]
+    before = ways[episodes < away[0].first_episode]
     if not len(before) and start is not None:
-        before = ways_between_bumps(newest(start, world))
-    after = ways[(episodes >= first) & (episodes <= last)]
+        before = ways_between_bumps(start.evaluated(world))
+    after = ways[(episodes >= away[0].first_episode) & (episodes <= away[-1].last_episode)]
     if not len(before) or not len(after):
         return None
     return Kept(run.info.seed, float(before[-1]), float(after[-1]))
@@ -162,9 +138,8 @@ def number(value: float) -> str:
     """Three digits that count, thousands apart; a dash for none."""
     if not math.isfinite(value):
         return "-"
-    if abs(value) >= 100 or value == round(value):
-        return f"{value:,.0f}".replace("-", "−")
-    return f"{value:.3g}".replace("-", "−")
+    whole = abs(value) >= 100 or value == round(value)
+    return (f"{value:,.0f}" if whole else f"{value:.3g}").replace("-", "−")
 
 
 def spread(values: Floats) -> str:

@@ -1,17 +1,15 @@
 """Rates of bumps compared seed by seed: tables, a figure and sentences (docs/comparison.md)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from experiments.report.document import Block, Findings, Missing, Picture, Table, table
-from experiments.report.figures.style import GREY, INK, label_rows, sheet, styled
+from experiments.report.figures.style import GREY, INK, sheet, styled
 from experiments.report.measures import number
 from experiments.report.run_folder import Experiment, Rows, RunFolder
 from experiments.verdicts import MARGIN, Floats, Paired, holm, log_rates, paired
@@ -20,8 +18,7 @@ Drives = Mapping[int, tuple[float, float]]
 """Bumps and actions of frozen drives by seed."""
 
 
-@dataclass(frozen=True)
-class Ratio:
+class Ratio(NamedTuple):
     """Two strategies compared in one corridor."""
 
     ours: str
@@ -32,16 +29,11 @@ class Ratio:
     """Corrected for the number of comparisons."""
 
 
-def newest_drives(experiment: Experiment, world: str) -> Drives:
-    """Bumps and actions of the newest frozen drives, by seed."""
-    return _drives({run.info.seed: run.evaluated(world) for run in experiment.runs})
-
-
-def stage_drives(experiment: Experiment, stage: str, world: str) -> Drives:
-    """Bumps and actions of the frozen drives at the end of a stage, by seed."""
-    label = f"stage {stage}"
+def newest_drives(experiment: Experiment, world: str, label: str = "") -> Drives:
+    """Bumps and actions of the newest frozen drives, by seed: of all, or of those of a label."""
+    only = {"label": label} if label else {}
     runs = experiment.runs
-    return _drives({run.info.seed: run.evaluated(world).where(label=label) for run in runs})
+    return _drives({run.info.seed: run.evaluated(world).where(**only) for run in runs})
 
 
 def drives_at_equal_actions(
@@ -49,12 +41,8 @@ def drives_at_equal_actions(
 ) -> tuple[Drives, Drives]:
     """Newest frozen drives of both, by seed, up to as many actions as the one that drove less.
 
-    Args:
-        ours: One experiment.
-        theirs: The other.
-        named: Experiments by name, among them those that the two go on from: their drives and
-            actions come before.
-        world: Where they drove frozen.
+    named: Experiments by name, among them those that the two go on from: their drives and actions
+        come before.
     """
     mine, other = (
         {run.info.seed: _with_before(run, named, world) for run in each.runs}
@@ -102,15 +90,9 @@ def common_seeds(ours: Drives, theirs: Drives) -> list[int]:
 def ratios(
     ours: str, others: Sequence[str], world: str, drives: Mapping[str, Drives]
 ) -> list[Ratio]:
-    """Compare one strategy with others, corrected by Holm's method.
+    """Compare one strategy with others by their drives in a world, corrected by Holm's method.
 
     Others with fewer than 2 common seeds are left out.
-
-    Args:
-        ours: Name of one.
-        others: Names of those it is compared with.
-        world: Where they drove.
-        drives: Of all of them, by name.
     """
     found: dict[str, Paired] = {}
     for other in others:
@@ -130,7 +112,7 @@ def ratio_blocks(
     caption = "Bumps of the first divided by those of the other, seed by seed."
     return [
         ratio_table(name, title, found),
-        Findings((*told(found), *more)),
+        Findings((*(_told(*each[:4]) for each in found), *more)),
         Picture(f"{name}-figure", title, caption, partial(ratio_figure, found)),
     ]
 
@@ -151,15 +133,10 @@ def ratio_table(name: str, title: str, found: Sequence[Ratio]) -> Table:
     })  # fmt: skip
 
 
-def told(found: Sequence[Ratio]) -> list[str]:
-    """A sentence for each comparison."""
-    sentences = []
-    for each in found:
-        pair = each.paired
-        interval = f"{number(pair.ratio)} times ({number(pair.low)} to {number(pair.high)})"
-        said = f"In {each.world}, {each.ours} bumps {interval} as often as {each.theirs}"
-        sentences.append(f"{said}: {_WORDS[pair.verdict]}.")
-    return sentences
+def _told(ours: str, theirs: str, world: str, pair: Paired) -> str:
+    """A comparison as a sentence."""
+    interval = f"{number(pair.ratio)} times ({number(pair.low)} to {number(pair.high)})"
+    return f"In {world}, {ours} bumps {interval} as often as {theirs}: {_WORDS[pair.verdict]}."
 
 
 _WORDS = {
@@ -185,6 +162,9 @@ def ratio_figure(found: Sequence[Ratio]) -> Figure:
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
-    label_rows(axes, [f"{each.ours} / {each.theirs} ({each.world})" for each in found])
+    names = [f"{each.ours} / {each.theirs} ({each.world})" for each in found]
+    axes.set_yticks(range(len(names) - 1, -1, -1), names)
+    axes.set_ylim(-0.6, len(names) - 0.4)
+    axes.grid(axis="y", visible=False)
     axes.set_xlabel("ratio of bumps, 95 % interval; grey: counts as equal")
     return figure

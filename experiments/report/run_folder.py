@@ -22,7 +22,15 @@ from experiments.records import EVALUATION_COLUMNS, TourRecord
 from experiments.runs import probes
 from experiments.runs.probes import Probes
 from shared.errors import ConfigError, StateError, first_problem
-from shared.run_record import RUN, SERVICES, RunInfo, read_csv, read_episodes, samples_by_world
+from shared.run_record import (
+    RUN,
+    SERVICES,
+    RunInfo,
+    StageInfo,
+    read_csv,
+    read_episodes,
+    samples_by_world,
+)
 
 Floats = npt.NDArray[np.float64]
 T = TypeVar("T")
@@ -31,16 +39,6 @@ LEAST_WINDOW = 10
 """Episodes that a point of a curve averages at the smallest scale."""
 WINDOW = 100
 """Episodes that a point of a curve averages at full scale (A37)."""
-
-
-@dataclass(frozen=True)
-class Stage:
-    """A stage with an end, for figures: the newest episode while it goes on."""
-
-    name: str
-    world: str
-    first_episode: int
-    last_episode: int
 
 
 _TOURS = TypeAdapter(tuple[TourRecord, ...])
@@ -129,14 +127,12 @@ class RunFolder:
         return np.array(lengths, np.float64)
 
     @property
-    def stages(self) -> tuple[Stage, ...]:
-        """The stages so far."""
-        numbers = self.episodes.numbers("episode")
-        newest = int(numbers[-1]) if len(numbers) else 0
-        return tuple(
-            Stage(s.name, s.world, s.first_episode, s.last_episode or max(newest, s.first_episode))
-            for s in self.info.stages
-        )
+    def stages(self) -> tuple[StageInfo, ...]:
+        """The stages so far; one that goes on ends with the newest episode."""
+        newest = int(self.episodes.numbers("episode").max(initial=0.0))
+        ends = (s.last_episode or max(newest, s.first_episode) for s in self.info.stages)
+        pairs = zip(self.info.stages, ends, strict=True)
+        return tuple(stage.model_copy(update={"last_episode": end}) for stage, end in pairs)
 
     @cached_property
     def samples_by_world(self) -> dict[str, Floats]:

@@ -1,9 +1,7 @@
-"""Figures of curves and seeds: pure functions of arrays."""
-
-from __future__ import annotations
+"""Curves of seeds, and seeds together: pure functions of arrays."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,14 +11,12 @@ Curve = tuple[Floats, Floats]
 """Ascending places and the values there, float64 [n] each."""
 
 
-@dataclass(frozen=True)
-class Band:
-    """Seeds together: lowest, middle and highest value at every place."""
+class Band(NamedTuple):
+    """Seeds together at ascending places."""
 
     x: Floats
-    low: Floats
-    median: Floats
-    high: Floats
+    levels: Floats
+    """float64 [3, n]: lowest, middle and highest value at every place; NaN is a gap."""
     seeds: int
 
 
@@ -39,11 +35,8 @@ def block_means(episodes: Floats, values: Floats, size: int) -> Curve:
     """
     full = len(values) // size
     cut = values[: full * size].reshape(full, size)
-    there = ~np.isnan(cut)
-    count = there.sum(axis=1)
-    some = count > 0
-    sums = np.where(there, cut, 0.0).sum(axis=1)
-    return episodes[size - 1 : full * size : size][some], sums[some] / count[some]
+    some = ~np.isnan(cut).all(axis=1)
+    return episodes[size - 1 : full * size : size][some], np.nanmean(cut[some], axis=1)
 
 
 def band_of_blocks(curves: Sequence[Curve]) -> Band:
@@ -64,30 +57,17 @@ def band_between(curves: Sequence[Curve]) -> Band:
     end = min(float(places[-1]) for places, _ in curves)
     x = np.unique(np.concatenate([places for places, _ in curves]))
     x = x[(x >= start) & (x <= end)]
-    values = np.array([np.interp(x, places, heights) for places, heights in curves])
-    return _band(x, values)
+    return _band(x, np.array([np.interp(x, places, heights) for places, heights in curves]))
 
 
 def _band(x: Floats, values: Floats) -> Band:
-    if not len(x):
-        return Band(x, x, x, x, len(values))
-    return Band(
-        x,
-        np.nanmin(values, axis=0),
-        np.nanmedian(values, axis=0),
-        np.nanmax(values, axis=0),
-        len(values),
-    )
+    levels = (np.nanmin(values, axis=0), np.nanmedian(values, axis=0), np.nanmax(values, axis=0))
+    return Band(x, np.stack(levels), len(values))
 
 
 def with_gaps(band: Band, longest: float) -> Band:
     """The same band, with NaN in the middle of every stretch longer than this without a value."""
     after = np.flatnonzero(np.diff(band.x) > longest) + 1
     middles = (band.x[after - 1] + band.x[after]) / 2.0
-    low, median, high = (np.insert(y, after, np.nan) for y in (band.low, band.median, band.high))
-    return Band(np.insert(band.x, after, middles), low, median, high, band.seeds)
-
-
-def from_the_start(band: Band, first: float) -> Band:
-    """The same band with places counted from 1 at `first`."""
-    return Band(band.x - first + 1.0, band.low, band.median, band.high, band.seeds)
+    levels = np.insert(band.levels, after, np.nan, axis=1)
+    return Band(np.insert(band.x, after, middles), levels, band.seeds)

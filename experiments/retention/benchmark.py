@@ -1,7 +1,5 @@
 """The benchmark of retention as data: settings, entries, seeds, and what each network gets."""
 
-from __future__ import annotations
-
 import tomllib
 from importlib import resources
 from typing import Annotated, Any, NamedTuple, Self

@@ -1,7 +1,5 @@
 """What a strategy keeps of a stream, and what keeping it costs."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

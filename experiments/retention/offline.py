@@ -1,7 +1,5 @@
 """Choosing from everything that came: no strategy can, but it shows what a good choice is worth."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Literal
 

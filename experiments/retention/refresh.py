@@ -5,8 +5,6 @@ early policy went in the 50 actions that followed. Equalisation (Eq 3.5) moves i
 network predicts now.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Literal
 
@@ -61,13 +59,7 @@ class Refresher:
         self.needs_next = way == "next-value"
 
     def note(self, first: int, count: int, network: Predictor) -> None:
-        """Note what the network in force expects after new samples.
-
-        Args:
-            first: Place of the first one in the stream.
-            count: How many.
-            network: The one that computed their rewards.
-        """
+        """Note what the network in force expects after `count` new samples from this place on."""
         if self.needs_next:
             places = np.arange(first, first + count)
             self._then[places] = self._values_of_next(places, network)

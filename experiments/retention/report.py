@@ -6,8 +6,6 @@ adds the results in the folder MEASURED (`<out>/measured` of `corridor retention
 kept with the code.
 """
 
-from __future__ import annotations
-
 import json
 import lzma
 import sys
@@ -37,11 +35,7 @@ _RESULTS = TypeAdapter(tuple[Measured, ...])
 
 
 def load_measured(paths: Iterable[Path]) -> list[Measured]:
-    """Read results, of `corridor retention` or kept ones, sorted.
-
-    Raises:
-        StateError: A file is damaged.
-    """
+    """Read results, of `corridor retention` or kept ones, sorted. Raises StateError if damaged."""
     found: dict[tuple[str, str, int], Measured] = {}
     for path in paths:
         try:

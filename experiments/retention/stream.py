@@ -10,8 +10,6 @@ A run that is stopped and goes on continues its stream: what was written after i
 cut off and comes again.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from experiments.runs.watching import Watch
+from experiments.runs.totals import Watch
 from experiments.single_process import SingleProcess, TurnDone
 from shared.errors import StateError
 from shared.facts import IMAGE_BYTES, IMAGE_SHAPE

@@ -7,30 +7,50 @@
 Run again, it goes on: what is measured is left alone, and a recording continues.
 """
 
-from __future__ import annotations
-
+import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import get_args
 
 from pydantic import BaseModel, ConfigDict
+from rich.console import Console
 
+from experiments.drives.choosers import greedy, side_by_side
+from experiments.drives.frozen_drives import evaluate
+from experiments.drives.traces import Figures
+from experiments.environment import CorridorEnv, with_world
 from experiments.plans.plan import Plan, stage_config
 from experiments.plans.scales import load_plan
-from experiments.retention.benchmark import Benchmark, Entry, Setting, Work, config_of
+from experiments.retention.benchmark import (
+    Benchmark,
+    Entry,
+    Setting,
+    Work,
+    config_of,
+    load_benchmark,
+)
 from experiments.retention.contents import Mark, figures, managed
 from experiments.retention.offline import selected
 from experiments.retention.refresh import Refresher
 from experiments.retention.stream import Recorder, Stream
-from experiments.retention.worth import driven, learned
 from experiments.runs.run import Run
-from shared.config import Config
+from shared.config import Config, LearnerNumerics
+from shared.errors import ConfigError
 from shared.numerics import Role, settle
 from shared.provenance import machine_key
+from shared.rl.gradients import MeanOfWeights
+from shared.rl.learning import Trainer
+from shared.rl.memory import SampleStore
+from shared.rl.network import QNetwork, to_bytes
+from shared.rl.predictor import Predictor
+from shared.rl.schedule import Moment
 from shared.run_record import EPISODE_COLUMNS, EPISODES, RUN, RunInfo, made_here, read_csv
 from shared.statefile import write_atomically
 
+OUT = Path("runs") / "retention"
+"""Default folder of streams and results."""
 Tell = Callable[[str], None]
 
 
@@ -63,11 +83,7 @@ class Measured(BaseModel):
 def measure(
     benchmark: Benchmark, work: Sequence[Work], out: Path, tell: Tell, stopped: Callable[[], bool]
 ) -> bool:
-    """Do everything of `work` that is not done yet; return whether all of it is.
-
-    Raises:
-        CorridorError: A stream cannot be recorded or read.
-    """
+    """Do everything of `work` that is not done yet; return whether all is. Raises CorridorError."""
     for piece in work:
         path = measured_path(out, piece)
         if path.exists():
@@ -195,3 +211,86 @@ def _settled(config: Config, plan: Plan, seed: int, out: Path) -> Config:
     roles = {role: settle(config, common, role) for role in get_args(Role)}
     numerics = config.numerics.model_copy(update=roles)
     return config.model_copy(update={"numerics": numerics})
+
+
+def learned(
+    samples: SampleStore,
+    config: Config,
+    numerics: LearnerNumerics,
+    seed: int,
+    steps: int,
+    averaged: int,
+) -> bytes:
+    """Let a network learn from these samples, in shuffled epochs, from random weights on.
+
+    The weights of the last `averaged` steps are averaged: the mean, as safetensors bytes.
+    """
+    epochs = -(-steps * config.learning.batch_size // len(samples)) + 1
+    learning = config.learning.model_copy(
+        update={"fit_every": 1, "fit_every_actions": 0, "fit_epochs": epochs}
+    )
+    trainer = Trainer(config.network, learning, numerics, seed)
+    mean = MeanOfWeights(trainer.train_network)
+    for done, _ in enumerate(islice(trainer.learn(samples, Moment(1)), steps), 1):
+        if done > steps - averaged:
+            mean.take()
+    network = QNetwork(config.network).requires_grad_(False)
+    mean.copy_to(network)
+    return to_bytes(network)
+
+
+def driven(
+    weights: bytes, config: Config, worlds: Sequence[str], starts: int, actions: int
+) -> dict[str, Figures]:
+    """Let a frozen network drive in worlds; return the figures of each."""
+    network = Predictor(config.network, side_by_side(config.numerics.actor))
+    network.load(1, weights)
+    found = {}
+    for world in worlds:
+        env = CorridorEnv(config=with_world(config, world))
+        try:
+            found[world] = evaluate(env, greedy(network), starts, actions).figures
+        finally:
+            env.close()
+    return found
+
+
+def run(
+    setting: str, seeds: Sequence[int], entries: Sequence[str], out: Path | None, console: Console
+) -> int:
+    """Measure all seeds and entries, or these; return 0, or 1 when stopped before the end.
+
+    Raises:
+        ConfigError: There is no such setting or entry.
+        CorridorError: A stream cannot be recorded or read.
+    """
+    benchmark, folder = load_benchmark(), out or OUT
+    work = chosen(benchmark, setting, seeds, entries)
+    stop = [False]
+
+    def stopping(*_: object) -> None:
+        stop[0] = True
+        console.print("stopping; the same command goes on")
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stopping)
+    done = sum(measured_path(folder, piece).exists() for piece in work)
+    console.print(f"{len(work)} measurements, {done} of them done; results in {folder}")
+    return 0 if measure(benchmark, work, folder, console.print, lambda: stop[0]) else 1
+
+
+def chosen(
+    benchmark: Benchmark, setting: str, seeds: Sequence[int], entries: Sequence[str]
+) -> list[Work]:
+    """Return the work, seed by seed. Raises ConfigError."""
+    known = {entry.name for entry in benchmark.entries}
+    if unknown := set(entries) - known:
+        expected = ", ".join(sorted(known))
+        raise ConfigError(f"--entry: expected one of {expected}, got {unknown.pop()!r}")
+    found = benchmark.setting(setting)
+    return [
+        Work(found, entry, seed)
+        for seed in seeds or range(1, benchmark.primary_seeds + 1)
+        for entry in benchmark.entries_of(found, seed)
+        if not entries or entry.name in entries
+    ]

@@ -1,7 +1,5 @@
 """The record of one episode, of a memory, and what proves that compared runs began alike."""
 
-from __future__ import annotations
-
 import hashlib
 
 import numpy as np

@@ -1,16 +1,12 @@
 """Looks at the network of a run with robots of its own, so that nothing of the run is disturbed."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path
 
 from experiments.drives import routes
 from experiments.drives.choosers import greedy, side_by_side
-from experiments.drives.frozen_drives import drive_from_first_start, evaluate
-from experiments.drives.predictions import prediction_figures
-from experiments.drives.references import DRIVERS, reference
+from experiments.drives.frozen_drives import DRIVERS, drive_from_first_start, evaluate, reference
 from experiments.drives.tour import drive_tour
 from experiments.drives.traces import Figures, first_lap
 from experiments.environment import CorridorEnv, with_world
@@ -31,10 +27,7 @@ LAP_ACTIONS = 400
 class Observer:
     """Drives with one network, frozen, in any world as its file says, and records it.
 
-    Args:
-        plan: Plan of the run.
-        folder: Folder of the run.
-        config: Configuration of its first stage.
+    config: Of the first stage of the run in this folder.
     """
 
     def __init__(self, plan: Plan, folder: Path, config: Config) -> None:
@@ -54,12 +47,9 @@ class Observer:
             self._shown = weights
 
     def evaluate(self, world: str, now: Row, *, over: bool) -> None:
-        """Drive greedily: thoroughly at the end of a stage, briefly and in `world` on the way.
+        """Drive greedily: thoroughly as a stage is `over`, briefly and in `world` on the way.
 
-        Args:
-            world: Where the run drives.
-            now: Columns that say how far the run is.
-            over: Whether the stage is over.
+        now: Columns that say how far the run is.
         """
         settings = self._plan.evaluation
         label = f"stage {now['stage']}" if over else "every"
@@ -68,23 +58,13 @@ class Observer:
         rows = []
         for each in (settings.worlds if over else ()) or (world,):
             done = evaluate(self._env(each), greedy(self._network_of_many), starts, actions)
-            seen = self._predictions(each) if over else {}
-            rows.append(_row(label, "network", each, {**done.figures, **seen}, now))
+            rows.append(_row(label, "network", each, done.figures, now))
         append_csv(self._folder / EVALUATIONS, EVALUATION_COLUMNS, rows)
-
-    def _predictions(self, world: str) -> Figures:
-        """How well predictions agree with what follows; without those that cannot be told."""
-        settings = self._plan.evaluation
-        found = prediction_figures(
-            self._env(world), self._network_of_many, settings.every_starts, settings.actions
-        )
-        return {name: value for name, value in found.items() if math.isfinite(value)}
 
     def drives_lap(self, world: str) -> bool:
         """Whether it drives round the lap centre without a bump, from the world's first start.
 
-        Raises:
-            ValueError: The world has no lap centre.
+        Raises ValueError without a lap centre.
         """
         env = self._env(world)
         trace = drive_from_first_start(env, greedy(self._network), LAP_ACTIONS)
@@ -99,8 +79,7 @@ class Observer:
     def drive_tours(self, world: str) -> None:
         """Carry out the test drives (A45); write their routes, and `tours.json` about all.
 
-        Raises:
-            ValueError: The world has no route.
+        Raises ValueError for a world without a route.
         """
         env, told = self._env(world), []
         for number, start in enumerate(env.robot.world.starts[: self._plan.tours]):

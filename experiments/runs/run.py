@@ -5,8 +5,6 @@ interrupted at any moment goes on from its last snapshot as if nothing had happe
 recorded after that snapshot is written again.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -22,8 +20,7 @@ from experiments.records import EVALUATION_COLUMNS
 from experiments.runs import snapshot, stages
 from experiments.runs.episode_row import episode_row, held, memory_hash
 from experiments.runs.observer import EVALUATIONS, Observer
-from experiments.runs.totals import Totals
-from experiments.runs.watching import Progress, Watch
+from experiments.runs.totals import Progress, Totals, Watch
 from experiments.single_process import SingleProcess, TurnDone
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import load_world
@@ -52,13 +49,10 @@ SNAPSHOT_EVERY_S = 60.0
 
 
 class Run:
-    """A plan with a seed in a folder.
+    """A plan, at the wanted scale, with a seed in a folder.
 
     Args:
-        plan: The plan at the wanted scale.
-        scale: Name of the scale, for the record.
-        seed: Seed of every draw.
-        folder: Folder of this run, to be made or continued.
+        folder: To be made or continued.
         predecessor: Folder of the finished run this one goes on from, if the plan has one.
         command: What to run to repeat it.
         watch: Sees every turn.

@@ -4,8 +4,6 @@
 time on two cores. Run again, it goes on where it was stopped; finished runs are left alone.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import queue
@@ -22,11 +20,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
 
-from experiments.plans.plan import Plan
+from experiments.plans.plan import Plan, full_plan, plan_names
+from experiments.plans.scale_model import description
 from experiments.plans.scales import load_plan
 from experiments.runs.run import Run
-from experiments.runs.watching import Progress
-from shared.errors import CorridorError
+from experiments.runs.totals import Progress
+from shared.errors import ConfigError, CorridorError
 
 OUT = Path("runs") / "experiments"
 """Default folder of all experiments."""
@@ -179,6 +178,37 @@ def _watch(futures: list[Future[bool]], reports: Any, bars: Bars) -> None:
 
 def _failed(futures: list[Future[bool]]) -> bool:
     return any(future.done() and future.exception() is not None for future in futures)
+
+
+# ---------------------------------------------------------------- `corridor experiment`
+
+
+def listing() -> str:
+    """All plans with what they are, one a line."""
+    plans = [full_plan(name) for name in plan_names()]
+    width = max(len(plan.name) for plan in plans)
+    return "\n".join(
+        f"{plan.name:{width}}  {plan.title} ({plan.source})"
+        + (f"; after {plan.after}" if plan.after else "")
+        for plan in plans
+    )
+
+
+def described(names: Sequence[str], scale: str) -> str:
+    """How much of the plans a scale keeps. Raises ConfigError."""
+    return "\n\n".join(description(name, scale) for name in names)
+
+
+def run(
+    names: Sequence[str], scale: str, seeds: int, seed: int | None, jobs: int, out: Path | None
+) -> int:
+    """Run them; returns 0, or 1 when stopped before the end. Raises ConfigError, CorridorError."""
+    wanted = seeds if seed is None else [seed]
+    for name in names:
+        available = load_plan(name, scale).seeds
+        if isinstance(wanted, int) and wanted > len(available):
+            raise ConfigError(f"--seeds: {name} has {len(available)} seeds, got {wanted}")
+    return 0 if run_experiment(names, scale, wanted, out or OUT, jobs, Console()) else 1
 
 
 # ---------------------------------------------------------------- in the worker processes

@@ -1,7 +1,5 @@
 """The whole state of a single-process run on disk: a run goes on from it bit for bit (A46)."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path
@@ -75,8 +73,7 @@ def exists(folder: Path) -> bool:
 def restore(folder: Path, loop: SingleProcess) -> dict[str, Any]:
     """Bring a new loop to the saved state; returns `extra`.
 
-    Raises:
-        StateError: The snapshot is damaged, or of another network or seed.
+    Raises StateError: the snapshot is damaged, or of another network or seed.
     """
     episode = checkpoint.read(folder / CHECKPOINT, loop.trainer, _identity(loop)).episode
     try:

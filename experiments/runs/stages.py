@@ -1,7 +1,5 @@
 """Puts a stage of a plan into effect: configuration, world, retention and capacity of the loop."""
 
-from __future__ import annotations
-
 from experiments.plans.plan import Plan, Stage, merged
 from experiments.runs.totals import Totals
 from experiments.single_process import SingleProcess
@@ -13,17 +11,9 @@ from shared.rl.retention.strategy import begin
 
 
 def enter(loop: SingleProcess, plan: Plan, stage: Stage, config: Config, *, first: bool) -> None:
-    """Let the loop go on in a stage.
+    """Let the loop go on in a stage, between two turns; `first`: the run begins with it.
 
-    Args:
-        loop: The loop, between two turns.
-        plan: Plan of the run.
-        stage: The stage.
-        config: Configuration of the stage.
-        first: Whether the run begins with this stage.
-
-    Raises:
-        ConfigError: The driver refuses a change of the world.
+    Raises ConfigError when the driver refuses a change of the world.
     """
     before = loop.config
     loop.reconfigure(config)
@@ -46,11 +36,7 @@ def enter(loop: SingleProcess, plan: Plan, stage: Stage, config: Config, *, firs
 
 
 def change_world(loop: SingleProcess, plan: Plan, stage: Stage, totals: Totals) -> None:
-    """Tell the driver of the changes that are due in the next episode.
-
-    Raises:
-        ConfigError: The driver refuses one.
-    """
+    """Tell the driver of what is due in the next episode. Raises ConfigError when it refuses."""
     following = totals.done(loop, plan.counted_in) + 1
     for change in stage.changes[totals.changes :]:
         if change["at"] > following:

@@ -1,6 +1,4 @@
-"""Counts of a run beside those of its loop: time, stages, first lap, actions without a bump."""
-
-from __future__ import annotations
+"""What a run counts beside its loop, and what it tells of itself while it goes on."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -83,3 +81,25 @@ class Totals:
             "episode": loop.counters.episode,
             "train_steps": loop.trainer.train_steps,
         }
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a run is."""
+
+    run: str
+    done: int
+    of: int
+    unit: Unit
+    fitness: float
+    """Mean over the last episodes."""
+
+
+class Watch:
+    """Sees every turn of a run. This one does nothing about it."""
+
+    def begin(self, loop: SingleProcess) -> None:
+        """The run begins, or goes on from its last snapshot."""
+
+    def turn(self, loop: SingleProcess, done: TurnDone) -> None:
+        """A turn is over. The run may be stopped, and done again from an older snapshot."""

@@ -3,8 +3,6 @@
 No bus and no clock in here: the service and the single-process loop feed it observations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any

@@ -1,7 +1,5 @@
 """Talks to replay beside the loop: what one robot waits for holds up no other robot."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Whom a session of the actor believes: one life of its robot, and the newest learner."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The actor service: answers observations of all robots of the run, hands episodes to replay."""
 
-from __future__ import annotations
-
 import time
 from collections import defaultdict
 from collections.abc import Iterator

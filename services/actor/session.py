@@ -1,7 +1,5 @@
 """One robot at the actor: where its turn stands, from observation to acknowledged episode."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Collection
 from concurrent.futures import Future
@@ -161,12 +159,7 @@ class Session:
         self._publish(action)
 
     def heartbeat(self, undecodable: int, busy: int) -> ActorState:
-        """What the actor tells of this robot.
-
-        Args:
-            undecodable: messages that the actor could not take, of all robots together.
-            busy: messages for which it had no room.
-        """
+        """What the actor tells of this robot; `undecodable` and `busy` are those of all."""
         now_s, (then_s, count) = time.monotonic(), self._counted
         rate = (self.actor.actions - count) / max(now_s - then_s, 1e-6)
         self._counted = (now_s, self.actor.actions)

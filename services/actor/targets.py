@@ -1,7 +1,5 @@
 """Target networks of the versions in use: robots that act with one version share it."""
 
-from __future__ import annotations
-
 from weakref import WeakValueDictionary
 
 from shared.config import NetworkConfig, Numerics

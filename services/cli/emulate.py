@@ -1,7 +1,5 @@
 """The commands about robots that are not there: `corridor emulate ...`."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 import typer

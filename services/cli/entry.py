@@ -1,7 +1,5 @@
 """Where `corridor` begins: an emergency stop leaves before anything else is imported."""
 
-from __future__ import annotations
-
 import sys
 
 

@@ -1,7 +1,5 @@
 """The commands about experiments and what runs leave behind: run, report, evaluate."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 
@@ -44,7 +42,7 @@ def experiment(
 
     A plan that begins with the end of another runs that one first.
     """
-    commands = import_installed("experiments.runs.commands", "experiments")
+    commands = import_installed("experiments.runs.schedule", "experiments")
     if not names:
         typer.echo(commands.listing())
         return
@@ -72,7 +70,7 @@ def retention(
 
     Run again, it goes on. A stream takes a gigabyte.
     """
-    command = import_installed("experiments.retention.command", "experiments")
+    command = import_installed("experiments.retention.work", "experiments")
     console = import_installed("rich.console", "experiments").Console()
     raise typer.Exit(command.run(setting, seed or [], entry or [], out, console))
 
@@ -85,14 +83,10 @@ def report(
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the pages.")] = Path("report"),
-    gpu_step_ms: Annotated[
-        float | None,
-        typer.Option(help="Measured time of a GPU's gradient step; adds projected hours.", min=0),
-    ] = None,
 ) -> None:
     """Write figures, tables and findings of finished runs as HTML and Markdown."""
     full_report = import_installed("experiments.report.full_report", "experiments")
-    pages = full_report.write_report(runs, out, gpu_step_ms)
+    pages = full_report.write_report(runs, out)
     typer.echo(f"written: {pages[0]} and {len(pages) - 1} Markdown pages beside it")
 
 

@@ -5,8 +5,6 @@ is not known here, several runs, no router) is left to `corridor estop` as a who
 any case: it sends the same halt, with the same number, until all robots stand.
 """
 
-from __future__ import annotations
-
 import os
 import time
 import tomllib

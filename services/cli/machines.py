@@ -1,7 +1,5 @@
 """Commands for before the first metre: is this machine, and is this robot, ready?"""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 from typing import Annotated

@@ -7,8 +7,6 @@ Exit codes: 0 done, 1 crash or no answer, 2 wrong configuration or usage (told i
 state on disk is damaged or does not belong to this run, 4 another process has the role.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """The commands that make credentials: `corridor secure ...`. They need no router."""
 
-from __future__ import annotations
-
 import shutil
 from datetime import UTC, datetime, timedelta
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The commands about simulated worlds: `corridor world ...` and `corridor obstacle ...`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 

@@ -4,8 +4,6 @@ It is a safetensors file whose metadata hold a `Bundle` as JSON under `bundle`. 
 it as plain weights.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

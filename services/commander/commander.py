@@ -4,8 +4,6 @@ To the driver it is an actor: it answers observations. Others see it as the serv
 is that of the robot; the actor of a run, `main`, serves all of them.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -52,10 +50,8 @@ class Commander:
     def observe(self, timeout_s: float) -> Observation | None:
         """The newest observation that waits for an answer; None when none came in time.
 
-        One that was answered already has not reached the driver: the answer is sent again.
-
-        Raises:
-            RobotTaken: Somebody else began to command the robot.
+        One that was answered already has not reached the driver: the answer is sent again. Raises
+        RobotTaken when somebody else began to command the robot.
         """
         self._look_round()
         self._inbox.wait(timeout_s)

@@ -3,8 +3,6 @@
 It acts greedily and turns on the spot where it predicts nothing good (`shared.rl.spot_turns`).
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Networks that a run left behind, for driving without learning."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,8 +38,7 @@ class Frozen:
     def predictor(self, network: NetworkConfig, numerics: Numerics | None = None) -> Predictor:
         """The network ready to predict: one image at a time unless `numerics` tell otherwise.
 
-        Raises:
-            ConfigError: It is not of this shape.
+        Raises ConfigError when it is not of this shape.
         """
         predictor = Predictor(network, numerics or ActorNumerics())
         try:
@@ -54,11 +51,7 @@ class Frozen:
 
 
 def find(run: Path) -> Path:
-    """The file with the network of a run: its folder, or the file itself.
-
-    Raises:
-        ConfigError: There is none.
-    """
+    """The file with the network of a run: its folder, or the file itself. Raises ConfigError."""
     if run.is_file():
         return run
     for name in (CHECKPOINT, WEIGHTS):
@@ -76,11 +69,7 @@ def configuration_of(run: Path) -> Path | None:
 
 
 def read(path: Path) -> Frozen:
-    """Read a checkpoint of the learner, or a file of weights.
-
-    Raises:
-        StateError: It is damaged.
-    """
+    """Read a checkpoint of the learner, or a file of weights. Raises StateError when damaged."""
     try:
         with safe_open(path, framework="pt") as file:
             metadata = dict(file.metadata() or {})

@@ -1,7 +1,5 @@
 """Turns bytes of a terminal into keys, and keys into what a person wants. It has no clock."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ It answers the robot's observations as an actor would, so every limit of the dri
 are cut, contact stops, silence stops. The robot creeps and turns on the spot; it does nothing else.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Callable
@@ -28,15 +26,7 @@ HELP = (
 
 
 def run(config: Config, robot: str | None, echo: Callable[[str], None]) -> int:
-    """Let a person at this terminal move a robot until `q` or Ctrl-C.
-
-    Args:
-        config: How to reach the run.
-        robot: Which robot; None: the only one there is.
-        echo: Shows a line.
-
-    Returns:
-        The exit code.
+    """Let a person at this terminal move a robot until `q` or Ctrl-C; the exit code.
 
     Raises:
         ConfigError: Standard input is no terminal, or there is no such robot to choose.

@@ -1,7 +1,5 @@
 """A robot without a run: router and driver for as long as somebody commands the robot."""
 
-from __future__ import annotations
-
 import os
 import threading
 import time
@@ -31,9 +29,7 @@ def alone(config: Config, folder: Path) -> Iterator[Config]:
     The folder keeps logs and halts: a robot that was stopped stays so the next time. Nothing is
     learnt in it, so it may be used with other configurations later.
 
-    Raises:
-        ConfigError: The driver refuses the configuration, or the folder is one of a run.
-        PeerMissing: The robot is not there in time.
+    Raises ConfigError: refused by the driver, or a run's folder; PeerMissing: not there in time.
     """
     folder = folder.absolute()
     if (folder / "memory").exists() or (folder / "learner").exists():

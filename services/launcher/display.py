@@ -1,7 +1,5 @@
 """Where the live view goes: a table in a terminal, a line every few seconds anywhere else."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

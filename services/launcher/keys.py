@@ -5,8 +5,6 @@ it changes how the terminal works. So the thread here looks where it is each tim
 signals for itself, and takes the terminal again after Ctrl-Z and `fg`.
 """
 
-from __future__ import annotations
-
 import os
 import select
 import signal

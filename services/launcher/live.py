@@ -1,7 +1,5 @@
 """What a person sees while a run is up: pure functions from a view to text or a live table."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Nothing here goes through `sys.stdout`: Python flushes that at its end, and would wait again.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import threading

@@ -8,8 +8,6 @@ Children run in sessions of their own, so that Ctrl-C reaches only us, and are t
 (`services.launcher.tether`): when this process is killed, they end by themselves.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import re

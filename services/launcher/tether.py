@@ -4,8 +4,6 @@ The parent keeps a pipe to the child's standard input open and never writes to i
 goes, even by SIGKILL, the kernel closes the pipe, and the child stops itself.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

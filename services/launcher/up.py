@@ -1,7 +1,5 @@
 """`corridor up`: the whole system on one machine, from one command to a clean end."""
 
-from __future__ import annotations
-
 import logging
 import os
 import random

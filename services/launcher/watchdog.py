@@ -9,8 +9,6 @@ Silence is time in which we looked and the router was there: without a router no
 after a pause of this process nobody was. The router hangs when it answers nobody.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

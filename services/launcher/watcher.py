@@ -1,7 +1,5 @@
 """How a run looks from the bus, and the one order that `corridor up` gives its robots."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -8,8 +8,6 @@ Random state needs no saving: every draw is a function of seed and position (`sh
 The checkpoint before the newest is kept beside it, for the case that the newest cannot be read.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

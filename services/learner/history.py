@@ -1,7 +1,5 @@
 """Where the learner stands in the history of the memory, and which turns follow from there."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -29,8 +27,7 @@ class Place:
     def next_turns(self, turns: Sequence[Turn], checkpoint: object) -> tuple[Turn, ...]:
         """The turns to do, in order, of replay's answer to what comes after `since`.
 
-        Raises:
-            StateError: Replay's memory is not the one that the checkpoint was made with.
+        Raises StateError: replay's memory is not the one that the checkpoint was made with.
         """
         if self.episode:
             if not turns or turns[0].episode != self.episode:

@@ -1,7 +1,5 @@
 """The learner's copy of the memory, pulled change by change and exact at a known number."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The learner service: brings its mirror to each turn, trains, checkpoints, announces."""
 
-from __future__ import annotations
-
 import math
 import time
 from pathlib import Path

@@ -3,8 +3,6 @@
 It changes nothing. What only makes things slower is told and does not count as a failure.
 """
 
-from __future__ import annotations
-
 import os
 import platform
 import resource

@@ -7,8 +7,6 @@ only for robots that send observations, so without such robots the ping alone co
 healthy when it accepts a session.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import time

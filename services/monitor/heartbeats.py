@@ -1,7 +1,5 @@
 """The newest heartbeat of every service, and how old each is."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

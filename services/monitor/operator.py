@@ -1,7 +1,5 @@
 """What a person tells a run from outside: stop, emergency stop, pause, another world, and back."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from typing import Any, TypeVar
@@ -35,14 +33,9 @@ def command_robots(
     """Halt one robot or all of the run, or release them; print what each answers.
 
     A halt goes on until all stand, or until Ctrl-C. number: that of a halt that was sent before.
+    Returns 1 if a robot did not answer, else 0.
 
-    Returns:
-        0, or 1 if a robot did not answer.
-
-    Raises:
-        ConfigError: `robot` is not a name.
-        PeerMissing: there is no robot.
-        RouterMissing: there is no router.
+    Raises ConfigError (`robot` is not a name), PeerMissing or RouterMissing.
     """
     _check_name(robot)
     with Bus(config.bus, config.run.name) as bus, stop_on_signals() as ended:
@@ -56,20 +49,11 @@ def _check_name(robot: str | None) -> None:
 
 
 def change_world(config: Config, robot: str | None, **change: Any) -> int:
-    """Wish for a change of the world of one robot or all; print what each answers.
+    """Wish for a change (fields of `WorldChange`) of one robot's world or all; print the answers.
 
-    Args:
-        config: how to reach the run.
-        robot: which robot; None: all of the run.
-        change: fields of `WorldChange`.
+    Returns 1 if a robot did not answer or refused, else 0.
 
-    Returns:
-        0, or 1 if a robot did not answer or refused.
-
-    Raises:
-        ConfigError: the change or `robot` cannot be meant.
-        PeerMissing: there is no robot.
-        RouterMissing: there is no router.
+    Raises ConfigError (it cannot be meant), PeerMissing or RouterMissing.
     """
     try:
         message = WorldChange.model_validate({"id": new_life(), **change})
@@ -104,18 +88,9 @@ def _change_world(bus: Bus, name: str, message: WorldChange) -> bool:
 
 
 def stop_services(config: Config, services: Sequence[str]) -> int:
-    """Ask services to stop, drivers first, and wait until they are gone.
+    """Ask services to stop (none named: all), drivers first, and wait until they are gone.
 
-    Args:
-        config: how to reach the run.
-        services: names of services; empty: all.
-
-    Returns:
-        0, or 1 if one is still there at the end.
-
-    Raises:
-        PeerMissing: nobody to stop.
-        RouterMissing: there is no router.
+    Returns 1 if one is still there at the end, else 0. Raises PeerMissing or RouterMissing.
     """
     with Bus(config.bus, config.run.name) as bus:
         peers = [p for p in bus.peers() if not services or p.service in services]

@@ -1,7 +1,5 @@
 """Holding the folder of a run that is up (`shared.place`), and how to reach a run."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import time
@@ -23,10 +21,8 @@ def locked(folder: Path) -> Iterator[int]:
     """Hold the run folder for this process; yields the descriptor that holds the lock.
 
     Children that inherit the descriptor hold the lock too: a run counts as up until the last
-    process of it is gone, also after its supervisor was killed.
-
-    Raises:
-        ConfigError: another `corridor up` holds it.
+    process of it is gone, also after its supervisor was killed. Raises ConfigError when another
+    `corridor up` holds it.
     """
     start_s = time.monotonic()
     with (folder / "lock").open("a+") as stream:
@@ -70,10 +66,8 @@ def reach(
     """The configuration by which a running run is reached from outside.
 
     A given endpoint (option or environment) is taken as it is. Otherwise the run that is up in
-    `run_dir`, or the only one in `runs/`, is meant; without one, the default endpoint.
-
-    Raises:
-        ConfigError: several runs are up and none was chosen.
+    `run_dir`, or the only one in `runs/`, is meant; without one, the default endpoint. Raises
+    ConfigError when several runs are up and none was chosen.
     """
     chosen = {"run.name": run, "bus.endpoint": endpoint, "bus.credentials": credentials}
     overrides = [f"{key}={settings.toml_value(v)}" for key, v in chosen.items() if v is not None]

@@ -1,7 +1,5 @@
 """`corridor status`: who is alive in a run, and what each last told about itself."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Sequence
@@ -46,18 +44,9 @@ class Entry:
 
 
 def show(config: Config, *, as_json: bool, require: Sequence[str]) -> int:
-    """Print the state of a run.
+    """Print the state of a run; 0, or 1 if a service of `require` does not answer.
 
-    Args:
-        config: how to reach the run.
-        as_json: print one JSON object instead of tables.
-        require: services that must answer.
-
-    Returns:
-        0, or 1 if a required service does not answer.
-
-    Raises:
-        RouterMissing: there is no router.
+    Raises RouterMissing.
     """
     with Bus(config.bus, config.run.name) as bus:
         reader = Reader(inbox := bus.inbox())

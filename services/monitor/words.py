@@ -1,7 +1,5 @@
 """What services tell about themselves, as words: pure functions from heartbeats to text."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from shared.facts import SHORT_NAMES

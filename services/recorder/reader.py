@@ -3,8 +3,6 @@
 A recording whose writer was killed ends in the middle; what came before is read.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import struct
@@ -59,12 +57,8 @@ class _File(BufferedReader):
 class Recording:
     """A recording in a file; every pass over it begins anew.
 
-    Args:
-        path: The file.
-
-    Raises:
-        ConfigError: There is no such file.
-        StateError: It is no recording of this project, or is damaged at its beginning.
+    Raises ConfigError: there is no such file; StateError: it is no recording of this project, or is
+    damaged at its beginning.
     """
 
     def __init__(self, path: Path) -> None:

@@ -12,8 +12,6 @@
 Chunks are not compressed, so that a reader can bound what it takes into memory before it does.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

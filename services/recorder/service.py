@@ -1,7 +1,5 @@
 """The recorder: hears everything a run publishes, fetches every version of the weights, writes."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Hears every message of `latest` streams, in the order of arrival, for one thread."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter, deque
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The feed: numbered changes as they are written, and what learners pull of the memory."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any, Literal
 

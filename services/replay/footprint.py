@@ -1,7 +1,5 @@
 """Keeping the process small: what is asked of the C library, where it can (Linux, glibc)."""
 
-from __future__ import annotations
-
 import ctypes
 import mmap
 from pathlib import Path

@@ -5,8 +5,6 @@ bulk    streams changes, snapshots and mini-batches from read transactions
 turns   owns the memory (`worker.TurnWorker`)
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterable

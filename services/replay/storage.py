@@ -1,7 +1,5 @@
 """Writing the replay memory: submissions, turns, and loading what was written."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any

@@ -18,8 +18,6 @@ One write transaction commits an episode, another one applies a whole turn: a ki
 leaves one of the two states, and the turn is done again from the first.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ It reads committed episodes from disk, waits for the weights they need, appends,
 and applies the result in one transaction. Killed at any moment, it does the turn again.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

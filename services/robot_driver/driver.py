@@ -4,8 +4,6 @@ The service and the single-process loop both use it. A robot only senses and mov
 How it moves is decided in `motion_control.py`; sequence numbers, bumps and commands are here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What a driver needs of the process it runs in; the driver itself knows no bus and no disk."""
 
-from __future__ import annotations
-
 from typing import Any
 
 

@@ -1,7 +1,5 @@
 """The kinds of robots there are, and how one of them is made ready to drive."""
 
-from __future__ import annotations
-
 import logging
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Moves one robot by actions, motions and recoveries, always within the limits of `safety.py`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ It uses nothing but `drive`, `run` and `feel`, so it serves simulated and real r
 bumper has one bit for the whole ring: a pressed bumper cannot tell front from rear.
 """
 
-from __future__ import annotations
-
 import math
 
 from services.robot_driver.host import Host
@@ -71,11 +69,7 @@ def back_off(robot: Base, config: RobotConfig, heading_rad: float) -> float:
     it does not begin its next action against that wall. It does not where the bumper never let go:
     nobody knows on which side it is pressed. It stands still afterwards.
 
-    Returns:
-        Distance between the poses before and after, metres.
-
-    Raises:
-        RobotFault: The robot cannot be read or commanded.
+    Returns the distance between the poses before and after, metres. Raises RobotFault.
     """
     start = robot.feel().pose
     blocked = _move(robot, config, -config.recovery_distance_m)
@@ -94,13 +88,9 @@ def back_off(robot: Base, config: RobotConfig, heading_rad: float) -> float:
 def let_go(robot: Base, config: RobotConfig, direction: float) -> None:
     """Creep straight until the bumper is free, at most `LET_GO_M`; stand still then.
 
-    Args:
-        robot: Its bumper was free before it moved the other way.
-        config: Speed and limits.
-        direction: 1.0 forward, -1.0 backwards.
+    The bumper was free before it moved the other way. direction: 1.0 forward, -1.0 backwards.
 
-    Raises:
-        RobotFault: The robot cannot be read or commanded.
+    Raises RobotFault: the robot cannot be read or commanded.
     """
     speed, left = _creeping(config), LET_GO_M
     while left > 0.0 and robot.feel().contact:

@@ -1,7 +1,5 @@
 """Limits below everything else: whatever the network says, these hold (no bus, no clock)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ No bus and no clock in here. A change is due at an episode; which one it is, the
 tell (`driver.py`), so that a run with changes can be repeated.
 """
 
-from __future__ import annotations
-
 from bisect import insort
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence

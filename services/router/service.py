@@ -4,8 +4,6 @@ Spread-out installations may use the official `zenohd` in its place; services ca
 apart.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 from pathlib import Path

@@ -4,8 +4,6 @@ The official zenohd and our own router read the same file. Keys and certificates
 works wherever it lies, and only its owner may read it.
 """
 
-from __future__ import annotations
-
 import json
 from base64 import b64encode
 from pathlib import Path

@@ -8,8 +8,6 @@ A credential may also hear what it publishes and ask what it answers, under its 
 health check inside a container needs no second credential.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from typing import Any, Literal

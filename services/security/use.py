@@ -15,12 +15,8 @@ if TYPE_CHECKING:
 def using(config: Config, *names: str) -> Config:
     """The configuration with the folder of one process in the place of a folder of all.
 
-    Args:
-        config: `bus.credentials` may be a folder with a certificate, or hold such folders.
-        names: of folders that fit this process, the best first.
-
-    Raises:
-        ConfigError: there is no such folder.
+    `bus.credentials` may be a folder with a certificate, or hold such folders; `names` are those
+    that fit this process, the best first. Raises ConfigError when there is none.
     """
     given = config.bus.credentials
     if not given:

@@ -5,8 +5,6 @@ comes late from somebody who has not heard of the release holds no robot again. 
 joined in any order, and as often as one likes, with the same result.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

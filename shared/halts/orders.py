@@ -4,8 +4,6 @@ A halt is sent again until every driver that is there, or was there meanwhile, h
 robot stands. Services keep it for drivers that restart (`shared.halts.keeper`).
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field

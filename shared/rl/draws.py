@@ -3,8 +3,6 @@
 It does not matter which process draws, in which order, or how often it restarted.
 """
 
-from __future__ import annotations
-
 import hashlib
 
 import numpy as np

@@ -24,12 +24,7 @@ if TYPE_CHECKING:
 
 
 class Gradients:
-    """Computes losses and gradients of one network.
-
-    Args:
-        network: Its parameters get the gradients.
-        numerics: Device, threads, precision, and images per pass.
-    """
+    """Computes losses and gradients of one network, whose parameters get the gradients."""
 
     def __init__(self, network: QNetwork, numerics: Numerics) -> None:
         self._network, self._numerics = network, numerics

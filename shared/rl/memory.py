@@ -4,8 +4,6 @@
 where samples come from and the columns of `retention`, which decides what goes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np

@@ -5,8 +5,6 @@ the last bit, whatever the processor: exact means over areas, and each step ends
 half up. Whatever changes one pixel must raise `PREPROCESS_VERSION`.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """When something periodic is due: after so many episodes, or after so many actions (E25, E39)."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 

@@ -5,8 +5,6 @@ turns on the spot instead: to the left if its action turns left, else to the rig
 direction until an action with a prediction of 0 or more comes up.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 
@@ -19,11 +17,7 @@ Side = Literal["", "left", "right"]
 
 
 class SpotTurns:
-    """When to turn on the spot, and to which side.
-
-    Args:
-        turn_rad: Angle of one turn, which lasts as long as an action.
-    """
+    """When to turn on the spot, and to which side; a turn by `turn_rad` is as long as an action."""
 
     def __init__(self, turn_rad: float) -> None:
         self._most = round(MOST_TURNING_RAD / turn_rad)
@@ -31,12 +25,7 @@ class SpotTurns:
         self._turns = 0
 
     def decide(self, values: Values, action: int) -> Side:
-        """The side to turn to now, or empty: drive the action.
-
-        Args:
-            values: Clipped predictions of all actions.
-            action: The best of them.
-        """
+        """The side to turn to now, or empty: drive the action, the best by clipped predictions."""
         if values[action] >= 0.0 or self._turns >= self._most:
             self._side, self._turns = "", 0
             return ""

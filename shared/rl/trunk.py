@@ -6,8 +6,6 @@ averages out; benchmarks/training_step.py measures both. So bfloat16 holds for t
 two thirds of the work.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -10,7 +10,7 @@ from robots import BRIDGE, RMW_ZENOH, fit, press, real_time, robotino_server, ro
 
 from benchmarks.waiting import wait_until
 from services.robot_driver.emulation.dynamics import CREATE3, ROBOTINO
-from services.robot_driver.emulation.robotino_faults import Faults
+from services.robot_driver.emulation.robotino import Faults
 from services.robot_driver.emulation.ros2_faults import Ros2Faults
 from services.robot_driver.kinds import make_link
 from services.robot_driver.real.hardware import HardwareRobot

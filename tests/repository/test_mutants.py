@@ -33,7 +33,6 @@ PACKAGES = (
     "experiments/runs",
     "experiments/drives",
     "experiments/report",
-    "experiments/baseline",
 )
 
 

@@ -1,9 +1,7 @@
 """Drives of frozen networks: curves over actions."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,8 +16,7 @@ REFERENCES = {"random": ":", "planner": "--"}
 """Line styles of the floor and the ceiling."""
 
 
-@dataclass(frozen=True)
-class Panel:
+class Panel(NamedTuple):
     """One of the figures side by side."""
 
     title: str

@@ -1,10 +1,8 @@
 """Images and the rewards that networks predict for them (Fig 4.7, 4.10, 4.16, 4.17, 4.19)."""
 
-from __future__ import annotations
-
 import string
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -79,8 +77,7 @@ def _bars(axes: Axes, values: Floats, title: str | None) -> None:
         axes.set_ylabel(title)
 
 
-@dataclass(frozen=True)
-class Choice:
+class Choice(NamedTuple):
     """Predictions of one network, and whose they are."""
 
     seed: int
@@ -104,8 +101,3 @@ def best(experiment: Experiment, world: str) -> Choice | None:
         if found := run.probes.get(f"best-{world}"):
             return Choice(run.info.seed, "best weights", found)
     return None
-
-
-def same_images(ours: Probes, theirs: Probes) -> bool:
-    """Whether two networks were asked about the same pictures."""
-    return np.array_equal(ours.images, theirs.images)

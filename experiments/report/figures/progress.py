@@ -1,32 +1,16 @@
-"""Fitness and loss over episodes (Fig 4.4, 4.5, 4.9, 4.12, 4.14)."""
+"""Fitness, loss and memory over episodes (Fig 4.4 to 4.6, 4.9, 4.11, 4.12, 4.14, 4.15)."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.report.figures.style import (
-    GREEN,
-    SWITCH,
-    colours,
-    draw_band,
-    draw_stages,
-    legend_below,
-    sheet,
-    styled,
-)
-from experiments.report.run_folder import Experiment, RunFolder
-from experiments.report.statistics import (
-    Band,
-    Curve,
-    band_of_blocks,
-    block_means,
-    from_the_start,
-    with_gaps,
-)
+from experiments.report.figures import style
+from experiments.report.figures.style import GREEN, GREY
+from experiments.report.run_folder import Experiment, Floats, RunFolder
+from experiments.report.statistics import Band, Curve, band_of_blocks, block_means, with_gaps
+from shared.facts import ACTION_COUNT, SHORT_NAMES
 
 FULL = 500
 """Highest fitness of an episode (A37)."""
@@ -47,16 +31,16 @@ def band_of(experiment: Experiment, column: str) -> Band:
     return with_gaps(band, LONGEST_LINE * experiment.runs[0].window)
 
 
-@styled
+@style.styled
 def fitness(experiment: Experiment) -> Figure:
     """Fitness in two plots, as in the thesis: everything, and around the best episodes."""
-    figure = sheet(4.6)
+    figure = style.sheet(4.6)
     above, below = figure.subplots(2, 1)
-    colour, window = colours([experiment.name])[experiment.name], experiment.runs[0].window
-    draw_band(above, band_of(experiment, "fitness"), colour, f"mean of {window} episodes")
+    colour, window = style.colours([experiment.name])[experiment.name], experiment.runs[0].window
+    style.draw_band(above, band_of(experiment, "fitness"), colour, f"mean of {window} episodes")
     for run in experiment.runs:
         _full_episodes(above, run)
-    draw_stages(above, experiment.runs[0].stages)
+    style.draw_stages(above, experiment.runs[0].stages)
     _labels(above)
     _around_the_best(below, experiment, colour)
     figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=2)
@@ -94,14 +78,14 @@ def _labels(axes: Axes) -> None:
     axes.set_ylim(0, FULL * 1.06)
 
 
-@styled
+@style.styled
 def loss(experiment: Experiment) -> Figure:
     """Mean loss over the window, logarithmic because it falls by orders of magnitude."""
-    figure = sheet(2.5)
+    figure = style.sheet(2.5)
     axes = figure.subplots()
-    colour, window = colours([experiment.name])[experiment.name], experiment.runs[0].window
-    draw_band(axes, band_of(experiment, "loss"), colour, f"mean of {window} episodes")
-    draw_stages(axes, experiment.runs[0].stages)
+    colour, window = style.colours([experiment.name])[experiment.name], experiment.runs[0].window
+    style.draw_band(axes, band_of(experiment, "loss"), colour, f"mean of {window} episodes")
+    style.draw_stages(axes, experiment.runs[0].stages)
     axes.set_yscale("log")
     axes.set_xlabel("episode")
     axes.set_ylabel("loss (squared error)")
@@ -109,43 +93,87 @@ def loss(experiment: Experiment) -> Figure:
     return figure
 
 
-@styled
-def continued(before: Experiment, after: Experiment) -> Figure:
-    """Fitness of an experiment and of the one that went on from it (Fig 4.5)."""
-    figure = sheet(2.9)
+@style.styled
+def compared(experiments: Sequence[Experiment], *, continued: bool = False) -> Figure:
+    """Fitness of several experiments, each from its own first episode (Fig 4.12).
+
+    continued: the last one goes on from the one before it, at a red line (Fig 4.5).
+    """
+    figure = style.sheet(3.1)
     axes = figure.subplots()
-    both = colours([before.name, after.name])
-    first, second = band_of(before, "fitness"), band_of(after, "fitness")
-    draw_band(axes, first, both[before.name], before.name)
-    draw_band(axes, second, both[after.name], after.name)
-    start = after.runs[0].episodes.numbers("episode")[0]
-    axes.axvline(start - 0.5, color=SWITCH, linestyle="--", linewidth=1.0)
-    _mean_labels(axes, (first, second), before.runs[0].window)
-    legend_below(axes, 2)
-    return figure
-
-
-@styled
-def compared(experiments: Sequence[Experiment]) -> Figure:
-    """Fitness of several experiments over their own episodes, each from 1 (Fig 4.12)."""
-    figure = sheet(3.1)
-    axes = figure.subplots()
-    named = colours(experiment.name for experiment in experiments)
-    bands = [
-        from_the_start(band_of(e, "fitness"), e.runs[0].episodes.numbers("episode")[0])
-        for e in experiments
-    ]
-    for experiment, band in zip(experiments, bands, strict=True):
-        draw_band(axes, band, named[experiment.name], experiment.name)
-    _mean_labels(axes, bands, experiments[0].runs[0].window)
-    axes.set_xlabel("episode of the run")
-    legend_below(axes, 3)
-    return figure
-
-
-def _mean_labels(axes: Axes, bands: Sequence[Band], window: int) -> None:
-    """Means stay far below 500 in hard experiments: the axis ends a little above the highest."""
-    highest = max(float(np.nanmax(band.high, initial=0.0)) for band in bands)
-    axes.set_xlabel("episode")
-    axes.set_ylabel(f"fitness (actions), mean of {window}")
+    named, highest = style.colours(experiment.name for experiment in experiments), 0.0
+    for experiment in experiments:
+        band = band_of(experiment, "fitness")
+        first = experiment.runs[0].episodes.numbers("episode")[0]
+        if not continued:
+            band = band._replace(x=band.x - first + 1.0)
+        elif experiment is experiments[-1]:
+            axes.axvline(first - 0.5, color=style.SWITCH, linestyle="--", linewidth=1.0)
+        style.draw_band(axes, band, named[experiment.name], experiment.name)
+        highest = max(highest, float(np.nanmax(band.levels[2], initial=0.0)))
+    axes.set_xlabel("episode" if continued else "episode of the run")
+    axes.set_ylabel(f"fitness (actions), mean of {experiments[0].runs[0].window}")
+    # Means stay far below 500 in hard experiments.
     axes.set_ylim(0, 1.1 * highest if highest else FULL)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=3)
+    return figure
+
+
+@style.styled
+def by_action(experiment: Experiment) -> Figure:
+    """Samples per action over episodes, and at the end."""
+    runs = experiment.runs
+    parts = {name: [_thinned(r, r.episodes.numbers(name)) for r in runs] for name in SHORT_NAMES}
+    quota = [_thinned(r, r.episodes.numbers("capacity") / ACTION_COUNT) for r in runs]
+    return _drawn(experiment, parts, style.ACTION_COLOURS, quota)
+
+
+@style.styled
+def by_world(experiment: Experiment) -> Figure:
+    """Samples per corridor over episodes, and at the end."""
+    runs = experiment.runs
+    names = sorted({name for run in runs for name in run.samples_by_world})
+    parts = {
+        name: [_thinned(r, r.samples_by_world.get(name, np.zeros(len(r.episodes)))) for r in runs]
+        for name in names
+    }
+    return _drawn(experiment, parts, style.colours(names), None)
+
+
+def _thinned(run: RunFolder, values: Floats) -> Curve:
+    """The state after every tenth part of a window: as much as can be seen."""
+    episodes = run.episodes.numbers("episode")
+    step = max(1, run.window // 10)
+    kept = episodes % step == 0
+    kept[-1:] = True
+    return episodes[kept], values[kept]
+
+
+def _drawn(
+    experiment: Experiment,
+    parts: Mapping[str, list[Curve]],
+    colour_of: Mapping[str, str],
+    quota: list[Curve] | None,
+) -> Figure:
+    figure = style.sheet(2.8)
+    over, end = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True)
+    for i, (name, curves) in enumerate(parts.items()):
+        style.draw_band(over, band_of_blocks(curves), colour_of[name], name)
+        last = np.array([values[-1] for _, values in curves])
+        middle = float(np.median(last))
+        spread = [[middle - last.min()], [last.max() - middle]]
+        end.bar(i, middle, color=colour_of[name], width=0.7)
+        end.errorbar(i, middle, yerr=spread, color=style.INK, capsize=3, linewidth=1.0)
+    if quota is not None:
+        limit = band_of_blocks(quota)
+        over.plot(limit.x, limit.levels[1], ":", color=GREY, label="equal share of the capacity")
+        end.axhline(limit.levels[1, -1], linestyle=":", color=GREY)
+    style.draw_stages(over, experiment.runs[0].stages)
+    over.set_xlabel("episode")
+    over.set_ylabel("samples in the memory")
+    over.set_ylim(bottom=0)
+    figure.legend(*over.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    end.set_xticks(range(len(parts)), list(parts))
+    end.set_title("at the end", pad=10)
+    end.grid(axis="x", visible=False)
+    return figure

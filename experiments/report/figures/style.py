@@ -1,9 +1,7 @@
 """How figures look: sizes, a palette that colour-blind people can tell apart, stages."""
 
-from __future__ import annotations
-
 import io
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import wraps
 from itertools import pairwise
 from typing import ParamSpec
@@ -13,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-from experiments.report.run_folder import Stage
 from experiments.report.statistics import Band
 from shared.facts import SHORT_NAMES
+from shared.run_record import StageInfo
 
 P = ParamSpec("P")
 
@@ -76,27 +74,23 @@ def png(figure: Figure) -> bytes:
 
 
 def colours(names: Iterable[str]) -> dict[str, str]:
-    """A colour for each name, in their order; colours repeat where `told_apart` says no."""
+    """A colour for each name, in their order; they repeat where there are too many names."""
     return {name: PALETTE[i % len(PALETTE)] for i, name in enumerate(names)}
 
 
 ACTION_COLOURS = colours(SHORT_NAMES)
 
 
-def told_apart(names: Collection[str]) -> bool:
-    """Whether there are enough colours for these names in one figure."""
-    return len(names) <= len(PALETTE)
-
-
 def draw_band(axes: Axes, band: Band, colour: str, label: str) -> None:
     """Median as a line, lowest to highest seed as an area."""
     marker = "o" if len(band.x) < 3 else ""
-    axes.plot(band.x, band.median, color=colour, label=label, marker=marker, markersize=3)
+    low, median, high = band.levels
+    axes.plot(band.x, median, color=colour, label=label, marker=marker, markersize=3)
     if band.seeds > 1:
-        axes.fill_between(band.x, band.low, band.high, color=colour, alpha=0.2, linewidth=0)
+        axes.fill_between(band.x, low, high, color=colour, alpha=0.2, linewidth=0)
 
 
-def draw_stages(axes: Axes, stages: tuple[Stage, ...]) -> None:
+def draw_stages(axes: Axes, stages: Sequence[StageInfo]) -> None:
     """Dashed lines between stages, red where the corridor changes, and their numbers on top."""
     for before, after in pairwise(stages):
         colour = GREY if before.world == after.world else SWITCH
@@ -104,30 +98,7 @@ def draw_stages(axes: Axes, stages: tuple[Stage, ...]) -> None:
         axes.axvline(place, color=colour, linestyle="--", linewidth=1.0, zorder=1)
     if len(stages) > 1:
         top = axes.secondary_xaxis("top")
-        middles = [(stage.first_episode + stage.last_episode) / 2 for stage in stages]
+        middles = [(s.first_episode + (s.last_episode or s.first_episode)) / 2 for s in stages]
         top.set_xticks(middles, [str(i + 1) for i in range(len(stages))])
         top.tick_params(length=0, colors=GREY, pad=1)
         top.spines["top"].set_visible(False)
-
-
-def stages_text(stages: tuple[Stage, ...]) -> str:
-    """What the numbers on top mean."""
-    if len(stages) < 2:
-        return ""
-    told = (
-        f"{i} {stage.name} ({stage.world}, {stage.first_episode} to {stage.last_episode})"
-        for i, stage in enumerate(stages, start=1)
-    )
-    return f"Stages, with their episodes: {'; '.join(told)}."
-
-
-def label_rows(axes: Axes, names: Sequence[str]) -> None:
-    """Names of rows, the first one on top: row i of n lies at height n - 1 - i."""
-    axes.set_yticks(range(len(names) - 1, -1, -1), names)
-    axes.set_ylim(-0.6, len(names) - 0.4)
-    axes.grid(axis="y", visible=False)
-
-
-def legend_below(axes: Axes, columns: int) -> None:
-    """The legend between axis and page, where it hides nothing."""
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=columns)

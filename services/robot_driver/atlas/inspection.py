@@ -184,7 +184,7 @@ def _unreachable(world: World, geometry: ActionGeometry) -> list[str]:
             starts.append((i, at, start.x_m, start.y_m))
     if not starts:
         return lines
-    parts = Reach.of(world, geometry.radius_m)
+    parts = Reach(world, geometry.radius_m)
     first, _, x, y = starts[0]
     home = parts.part_of(x, y)
     for _, at, x, y in starts:
@@ -208,25 +208,19 @@ def _unreachable(world: World, geometry: ActionGeometry) -> list[str]:
     return lines
 
 
-@dataclass(frozen=True)
 class Reach:
-    """Connected parts of the places where a robot's middle can be."""
+    """Connected parts of the places where a robot's middle can be, by flood fill over a grid."""
 
-    labels: npt.NDArray[np.int32]
-    """int32 [rows, columns]: 0 where it cannot be, else the number of the part."""
-    origin: tuple[float, float]
-    count: int
-
-    @classmethod
-    def of(cls, world: World, radius_m: float) -> Reach:
-        """Find the parts by flood fill over a grid of `CELL_M`."""
+    def __init__(self, world: World, radius_m: float) -> None:
         x0, y0, x1, y1 = world.bounds
         rows, columns = math.ceil((y1 - y0) / CELL_M) + 1, math.ceil((x1 - x0) / CELL_M) + 1
         y, x = np.mgrid[0:rows, 0:columns] * CELL_M
         room = world.clearance(np.column_stack([x.ravel() + x0, y.ravel() + y0]))
         fits = (room > radius_m).reshape(rows, columns).astype(np.uint8)
-        count, labels = cv2.connectedComponents(fits, connectivity=4)
-        return cls(np.asarray(labels, np.int32), (x0, y0), count - 1)
+        count, labels, self._stats, _ = cv2.connectedComponentsWithStats(fits, connectivity=4)
+        self.origin, self.count = (x0, y0), count - 1
+        self.labels = np.asarray(labels, np.int32)
+        """int32 [rows, columns]: 0 where it cannot be, else the number of the part."""
 
     def part_of(self, x_m: float, y_m: float) -> int:
         """Number of the part that a place belongs to, or the nearest one within two cells; or 0."""
@@ -241,12 +235,12 @@ class Reach:
 
     def area_m2(self, part: int) -> float:
         """Area of a part."""
-        return float(np.count_nonzero(self.labels == part)) * CELL_M**2
+        return float(self._stats[part, cv2.CC_STAT_AREA]) * CELL_M**2
 
     def size_m(self, part: int) -> float:
         """The longer side of the rectangle round a part."""
-        rows, columns = np.nonzero(self.labels == part)
-        return float(max(np.ptp(rows), np.ptp(columns))) * CELL_M
+        sides = self._stats[part, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]]
+        return float(sides.max() - 1) * CELL_M
 
     def somewhere(self, part: int) -> tuple[float, float]:
         """A place in a part."""

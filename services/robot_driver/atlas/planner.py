@@ -7,31 +7,26 @@ and exact geometry, so a real sequence of actions reaches it. A pose called save
 called lost might still be saved by a better plan.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
-from services.robot_driver.atlas.action_geometry import CONTACT_M, ActionGeometry, Floats
-from services.robot_driver.atlas.pose_grid import PoseGrid, Table
+from services.robot_driver.atlas.action_geometry import CONTACT_M, TURNS, ActionGeometry, Floats
 from services.robot_driver.simulated.world import World
-from services.robot_driver.simulated.world_parts import Route
 from shared.facts import ACTION_COUNT
 
 Ints = npt.NDArray[np.int64]
+Table = npt.NDArray[np.float32]
+"""float32 [headings, rows, columns]: rows run along y, columns along x, from the lower corner."""
+_WAY_POINTS = 5
+"""Points at which the way of one action is looked at."""
 
 _DISCOUNT = 0.99
 _SWEEPS = 250
-_ARRIVAL_M = 1.0
-"""The last part of a route, where a tour has arrived."""
-_CORNER_M = 2.5
-"""Corners of a route may be cut; who gets farther ahead at once has left out a part of it."""
-_ARRIVAL_GAIN = 100.0
-"""Gain of each action there: more than turning back before a dead end is worth."""
 _LOST = -100.0
 """Value of a run that cannot go on."""
 
@@ -49,10 +44,7 @@ class PlannedRuns:
 
 
 Gain = Callable[[Floats, Floats], Floats]
-"""Progress between poses before and after an action: two float64 [n, 3] to float64 [n].
-
-Minus infinity where the action is not wanted at all.
-"""
+"""Progress between poses before and after an action: two float64 [n, 3] to float64 [n]."""
 
 
 @dataclass(frozen=True)
@@ -65,14 +57,9 @@ class _Aim:
 
 
 class Planner:
-    """Tables for one world and one robot.
+    """Tables for one world and one robot, over a grid of positions and headings.
 
-    Args:
-        world: The map.
-        geometry: Geometry of the three actions.
-        cell_m: Grid distance of positions.
-        headings: Number of grid headings.
-        horizon: Actions a saved run lasts.
+    horizon: Actions that a saved run lasts.
     """
 
     def __init__(
@@ -101,81 +88,30 @@ class Planner:
     def race(
         self, pose: Floats, actions: int, direction: int, keep_m: float = 0.005
     ) -> PlannedRuns:
-        """The planned run from one pose [3] with most net angle round the lap centre.
+        """The planned run from one pose (x, y, heading) with most net angle round the lap centre.
 
         Where the room to keep cannot be kept, it makes for more room first.
 
-        Args:
-            pose: x, y, heading.
-            actions: Length of the run.
-            direction: 1 anticlockwise, -1 clockwise.
-            keep_m: Room to keep to all walls.
+        direction: 1 anticlockwise, -1 clockwise. keep_m: Room to keep to all walls.
 
-        Raises:
-            ValueError: The world has no lap centre.
+        Raises ValueError for a world without a lap centre.
         """
 
         def turned(before: Floats, after: Floats) -> Floats:
             return direction * _wrap(self._bearing(after) - self._bearing(before))
 
-        return self._pursue(pose, actions, (direction, keep_m), turned)
-
-    def tour(self, actions: int, keep_m: float = 0.005) -> PlannedRuns:
-        """The planned run along the world's route, from its first point towards its second.
-
-        Args:
-            actions: Length of the run, at most; it may go on beyond the end of the route.
-            keep_m: Room to keep to all walls.
-
-        Raises:
-            ValueError: The world has no route.
-        """
-        route = self._route
-        (x, y), (ahead_x, ahead_y) = route.points[:2]
-        pose = np.array([x, y, math.atan2(ahead_y - y, ahead_x - x)])
-
-        def advanced(before: Floats, after: Floats) -> Floats:
-            along = self.progress(after)
-            gain, arrived = along - self.progress(before), along > route.length_m - _ARRIVAL_M
-            follows = np.abs(gain) <= _CORNER_M
-            return np.where(follows, gain + _ARRIVAL_GAIN * arrived, -np.inf)
-
-        return self._pursue(pose, actions, (0, keep_m), advanced)
-
-    def progress(self, poses: Floats) -> Floats:
-        """How far along the world's route poses float64 [n, 3] are, metres, float64 [n].
-
-        It is the way from the first point to the place closest to each pose.
-
-        Raises:
-            ValueError: The world has no route.
-        """
-        points = np.array(self._route.points, np.float64)
-        start, legs = points[:-1], np.diff(points, axis=0)
-        lengths = np.hypot(*legs.T)
-        offset = poses[:, None, :2] - start
-        part = np.clip(np.einsum("nlj,lj->nl", offset, legs) / lengths**2, 0.0, 1.0)
-        leg = np.hypot(*(offset - part[..., None] * legs).transpose(2, 0, 1)).argmin(axis=1)
-        before = np.concatenate([[0.0], np.cumsum(lengths)])
-        return np.asarray(before[leg] + part[np.arange(len(poses)), leg] * lengths[leg])
+        key = (direction, keep_m)
+        if key not in self._aims:
+            self._aims[key] = _Aim(turned, keep_m, self._gain_table(turned, keep_m))
+        return self._roll_out(pose[None, :], actions, self._aims[key])
 
     def winding(self, poses: Floats) -> Floats:
         """Net angle round the lap centre along float64 [steps, 3], radians, float64 [steps].
 
-        Raises:
-            ValueError: The world has no lap centre.
+        Raises ValueError for a world without a lap centre.
         """
         angle = np.unwrap(self._bearing(poses))
         return np.asarray(angle - angle[0])
-
-    def _pursue(
-        self, pose: Floats, actions: int, key: tuple[int, float], gain: Gain
-    ) -> PlannedRuns:
-        """A run for gain; the key is its direction, 0 along the route, and the room to keep."""
-        if key not in self._aims:
-            keep_m = key[1]
-            self._aims[key] = _Aim(gain, keep_m, self._gain_table(gain, keep_m))
-        return self._roll_out(pose[None, :], actions, self._aims[key])
 
     def _roll_out(self, poses: Floats, actions: int, aim: _Aim | None) -> PlannedRuns:
         poses = poses.copy()
@@ -247,17 +183,100 @@ class Planner:
             table = np.maximum(np.maximum.reduce(best), np.float32(_LOST))
         return table
 
-    @property
-    def _route(self) -> Route:
-        if self.world.route is None:
-            raise ValueError(f"world {self.world.name!r} has no route")
-        return self.world.route
-
     def _bearing(self, poses: Floats) -> Floats:
         if self.world.lap is None:
             raise ValueError(f"world {self.world.name!r} has no lap centre")
         cx, cy = self.world.lap.centre
         return np.asarray(np.arctan2(poses[:, 1] - cy, poses[:, 0] - cx))
+
+
+class PoseGrid:
+    """Poses in a rectangle.
+
+    bounds: x and y of the lower corner, x and y of the upper corner, metres.
+    """
+
+    def __init__(
+        self,
+        bounds: tuple[float, float, float, float],
+        geometry: ActionGeometry,
+        cell_m: float,
+        headings: int,
+    ) -> None:
+        self.headings = headings
+        self._geometry, self._cell_m = geometry, cell_m
+        x0, y0, x1, y1 = bounds
+        self._origin = np.array([x0, y0])
+        columns, rows = math.ceil((x1 - x0) / cell_m) + 1, math.ceil((y1 - y0) / cell_m) + 1
+        y, x = np.mgrid[0:rows, 0:columns] * cell_m
+        self.shape = rows, columns
+        self.points: Floats = np.column_stack([x.ravel() + x0, y.ravel() + y0])
+        """float64 [rows * columns, 2]: the positions."""
+
+    @property
+    def heading_step(self) -> float:
+        """Angle between two grid headings, radians."""
+        return 2.0 * math.pi / self.headings
+
+    def least_on_way(self, plane: Table, action: int) -> Table:
+        """Least value of a plane [rows, columns] on the way of one action from each grid pose."""
+        parts = [(i + 1) / _WAY_POINTS for i in range(_WAY_POINTS)]
+        return np.stack(
+            [
+                np.minimum.reduce([self._shifted(plane, h, action, p, -1.0) for p in parts])
+                for h in range(self.headings)
+            ]
+        )
+
+    def after(self, table: Table, action: int, outside: float) -> Table:
+        """The table's values where one action leads from each grid pose, interpolated."""
+        turn = TURNS[action] * self._geometry.turn_rad / self.heading_step
+        low = math.floor(turn + 1e-9)
+        part = np.float32(turn - low) if turn - low > 1e-9 else np.float32(0.0)
+        ahead = np.roll(table, -low, axis=0)
+        if part:
+            ahead = (1 - part) * ahead + part * np.roll(table, -low - 1, axis=0)
+        return np.stack(
+            [self._shifted(ahead[h], h, action, 1.0, outside) for h in range(self.headings)]
+        )
+
+    def _shifted(self, plane: Table, h: int, action: int, part: float, outside: float) -> Table:
+        """One heading's plane, read at the place where part of an action leads."""
+        there = self._geometry.move(np.array([[0.0, 0.0, h * self.heading_step]]), action, part)[0]
+        dx, dy = there[0] / self._cell_m, there[1] / self._cell_m
+        return np.asarray(
+            cv2.warpAffine(
+                plane,
+                np.array([[1.0, 0.0, dx], [0.0, 1.0, dy]]),
+                (plane.shape[1], plane.shape[0]),
+                flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+                borderMode=cv2.BORDER_CONSTANT,
+                borderValue=(outside,),
+            ),
+            np.float32,
+        )
+
+    def look_up(self, table: Table, poses: Floats) -> Floats:
+        """Interpolated values of a table at float64 [n, 3], float64 [n]; grid edges repeat."""
+        rows, columns = self.shape
+        grid = (poses[:, :2] - self._origin) / self._cell_m
+        x = np.clip(grid[:, 0], 0.0, columns - 1.001)
+        y = np.clip(grid[:, 1], 0.0, rows - 1.001)
+        h = np.remainder(poses[:, 2] / self.heading_step, self.headings)
+        result = np.zeros(len(poses))
+        for dh in (0, 1):
+            for dy in (0, 1):
+                for dx in (0, 1):
+                    weight = np.ones(len(poses))
+                    for value, far in ((h, dh), (y, dy), (x, dx)):
+                        rest = value - np.floor(value)
+                        weight *= rest if far else 1.0 - rest
+                    result += weight * table[
+                        (np.floor(h).astype(np.int64) + dh) % self.headings,
+                        np.floor(y).astype(np.int64) + dy,
+                        np.floor(x).astype(np.int64) + dx,
+                    ]  # fmt: skip
+        return result
 
 
 def _wrap(angle_rad: Floats) -> Floats:

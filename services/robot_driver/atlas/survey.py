@@ -3,11 +3,9 @@
 `corridor world check` prints the result of `problems_in`, or, if there are none, of `survey`.
 """
 
-from __future__ import annotations
-
 import math
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -29,13 +27,11 @@ COMFORTABLE_M = 0.4
 """Room to all walls on the lap that stands for an ordinary driving line."""
 _RECOVERIES = 1000
 _RACE_ACTIONS = 600
-_TOUR_HORIZON = 6
 _SPACING_M = 0.1
 """Distance of the places at which the width is measured."""
 
 
-@dataclass(frozen=True)
-class RandomDrive:
+class RandomDrive(NamedTuple):
     """What a robot met that chose actions uniformly at random and recovered after each bump."""
 
     runs: npt.NDArray[np.int64]
@@ -58,8 +54,7 @@ def problems_in(path: Path, config: Config) -> list[str]:
 def survey(config: Config, world: World) -> Figures:
     """Measure the configured robot in a world, about a minute for each hundred square metres.
 
-    Returns:
-        Named figures: lengths in metres, angles in degrees.
+    The figures have names; lengths are in metres, angles in degrees.
     """
     geometry = ActionGeometry.of(config.robot)
     robot = SimRobot(config.robot, world, config.run.seed)
@@ -68,14 +63,20 @@ def survey(config: Config, world: World) -> Figures:
     finally:
         robot.close()
     planner = Planner(world, geometry, horizon=PLANNED_ACTIONS)
+    best = planner.drive(_start_poses(world)[:1], PLANNED_ACTIONS)
+    saved = planner.drive(driven.poses, PLANNED_ACTIONS).survived
     return {
         "world": world.name,
         **_geometry(world, geometry),
-        **_best_run(planner),
+        "best_fitness_from_start": int(best.survived[0]),
         **_laps(planner),
-        **_tour(world, geometry),
-        **_random_figures(driven),
-        **_saved(planner, driven),
+        "random_actions_to_bump_mean": float(driven.runs.mean()),
+        "random_actions_to_bump_median": float(np.median(driven.runs)),
+        "random_bumps_in_first_action": float((driven.runs == 0).mean()),
+        "retreat_mean_m": float(driven.retreats_m.mean()),
+        "recoveries": len(driven.runs),
+        f"recoveries_saved_for_{PLANNED_ACTIONS}_actions": float(np.mean(saved >= PLANNED_ACTIONS)),
+        "best_fitness_after_recovery_mean": float(saved.mean()),
     }
 
 
@@ -84,20 +85,18 @@ def drive_randomly(robot: SimRobot, bumps: int, seed: int) -> RandomDrive:
     config = robot.config
     draw = np.random.default_rng(seed)
     turns = [turn * config.turn_rad_s for turn in TURNS]
-    runs: list[int] = []
-    poses: list[tuple[float, float, float]] = []
-    retreats: list[float] = []
+    found: list[tuple[int, tuple[float, float, float], float]] = []
     actions = 0
-    while len(runs) < bumps:
+    while len(found) < bumps:
         robot.drive(Velocity(config.speed_m_s, 0.0, turns[int(draw.integers(3))]))
         if robot.run(config.period_s, stop_on_contact=True):
-            runs.append(actions)
+            won_m = back_off(robot, config, float(draw.uniform(-math.pi, math.pi)))
+            pose = (robot.pose.x_m, robot.pose.y_m, robot.pose.heading_rad)
+            found.append((actions, pose, won_m))
             actions = 0
-            retreats.append(back_off(robot, config, float(draw.uniform(-math.pi, math.pi))))
-            poses.append((robot.pose.x_m, robot.pose.y_m, robot.pose.heading_rad))
         else:
             actions += 1
-    return RandomDrive(np.array(runs), np.array(poses), np.array(retreats))
+    return RandomDrive(*(np.array(column) for column in zip(*found, strict=True)))
 
 
 def corridor_width(world: World) -> float:
@@ -134,11 +133,6 @@ def _geometry(world: World, geometry: ActionGeometry) -> Figures:
     }
 
 
-def _best_run(planner: Planner) -> Figures:
-    first = _start_poses(planner.world)[:1]
-    return {"best_fitness_from_start": int(planner.drive(first, PLANNED_ACTIONS).survived[0])}
-
-
 def _laps(planner: Planner) -> Figures:
     world = planner.world
     if world.lap is None:
@@ -169,22 +163,6 @@ def _actions_per_lap(
     return survived / laps if laps > 0.5 else math.inf
 
 
-def _tour(world: World, geometry: ActionGeometry) -> Figures:
-    """How much of the route a planned run drives, and in how many actions."""
-    if world.route is None:
-        return {}
-    # A dead end may end the route, so the run need not be able to go on for ever.
-    planner = Planner(world, geometry, horizon=_TOUR_HORIZON)
-    length = world.route.length_m
-    run = planner.tour(round(2.0 * length / geometry.step_m))
-    driven = planner.progress(run.poses[: int(run.survived[0]) + 1, 0])
-    return {
-        "route_m": length,
-        "route_driven_m": float(driven.max()),
-        "route_driven_actions": int(driven.argmax()),
-    }
-
-
 def _centre_line_lap(world: World) -> float:
     """Length of a lap at half the width of the narrowest side from the one island, cornered."""
     island = world.walls[1]
@@ -200,23 +178,3 @@ def _start_poses(world: World) -> npt.NDArray[np.float64]:
     """x, y, heading of all starts, float64 [n, 3]."""
     poses = [(s.x_m, s.y_m, math.radians(s.heading_deg)) for s in world.starts]
     return np.array(poses, np.float64)
-
-
-def _random_figures(driven: RandomDrive) -> Figures:
-    return {
-        "random_actions_to_bump_mean": float(driven.runs.mean()),
-        "random_actions_to_bump_median": float(np.median(driven.runs)),
-        "random_bumps_in_first_action": float((driven.runs == 0).mean()),
-        "retreat_mean_m": float(driven.retreats_m.mean()),
-        "recoveries": len(driven.runs),
-    }
-
-
-def _saved(planner: Planner, driven: RandomDrive) -> Figures:
-    survived = planner.drive(driven.poses, PLANNED_ACTIONS).survived
-    return {
-        f"recoveries_saved_for_{PLANNED_ACTIONS}_actions": float(
-            (survived >= PLANNED_ACTIONS).mean()
-        ),
-        "best_fitness_after_recovery_mean": float(survived.mean()),
-    }

@@ -1,7 +1,5 @@
 """Pictures of a world for people: a map from above and what the camera sees from several places."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
@@ -33,13 +31,9 @@ _ROUTE: Colour = (40, 140, 80)
 def render(name: str, out: Path) -> None:
     """Write `map.png`, `view-*.png` (640x360) and `image-*.png` (what the network sees, enlarged).
 
-    Args:
-        name: Of the world, or the path of its file.
-        out: Folder, made if missing.
+    name: Of the world, or the path of its file.
 
-    Raises:
-        WorldError: The world is missing or wrong.
-        OSError: A file cannot be written.
+    Raises WorldError: the world is missing or wrong; OSError: a file cannot be written.
     """
     world, robot = load_world(name), RobotConfig()
     out.mkdir(parents=True, exist_ok=True)

@@ -4,8 +4,6 @@ Measured figures of a Robotino and the published ones of a Create 3; what is not
 the worse case. Units are SI.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from dataclasses import dataclass, replace
@@ -111,10 +109,7 @@ class EmulatedBase:
     Time passes by `step` alone. Commands take effect `delay_s` after they arrived; the watchdog
     looks at the delayed commands, so that silence too takes the delay to become noticed.
 
-    Args:
-        body: What is moved.
-        dynamics: Figures of the base.
-        now_s: Time at the start, on the clock that `command` tells.
+    now_s: Time at the start, on the clock that `command` tells.
     """
 
     def __init__(self, body: Body, dynamics: BaseDynamics, now_s: float) -> None:

@@ -1,7 +1,5 @@
 """What faults of emulated robots have in common: named values, changed while they run."""
 
-from __future__ import annotations
-
 from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError

@@ -4,8 +4,6 @@ Beside the robot's own paths there are two for tests, which no fault reaches: `/
 (GET, POST) and `/emulator/truth` (GET).
 """
 
-from __future__ import annotations
-
 import json
 import math
 import signal
@@ -15,7 +13,7 @@ import threading
 import time
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 from urllib.parse import urlsplit
 
 import cv2
@@ -23,7 +21,7 @@ import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError
 
 from services.robot_driver.emulation.dynamics import ROBOTINO, STEP_S
-from services.robot_driver.emulation.robotino_faults import Faults
+from services.robot_driver.emulation.fault_set import FaultSet
 from services.robot_driver.emulation.world import EmulatedRobot, camera_of
 from services.robot_driver.robot import Velocity
 from shared.config import RobotConfig
@@ -45,6 +43,28 @@ FREE_M = 0.41
 """What distance sensors tell with nothing near; these ones never see anything."""
 Reply = tuple[int, str, bytes]
 _EMPTY: Reply = (HTTPStatus.OK, "application/json", b"")
+
+
+class Faults(FaultSet):
+    """What is wrong with the robot or with the way to it. Frozen; the defaults are a sound one."""
+
+    bumper: Literal["", "stuck", "unreadable", "nonsense"] = ""
+    """stuck: pressed; unreadable: status 500; nonsense: an object without the value."""
+    odometry: Literal["", "frozen", "stalled", "constant", "empty"] = ""
+    """frozen: the same reading again and again; stalled: the motors do not turn, readings go on;
+    constant: the same pose in new readings."""
+    camera: Literal["", "frozen", "500", "truncated", "empty", "noiseless", "flat"] = ""
+    """noiseless: equal pictures where it stands; flat: one grey alone."""
+    stall_s: float = Field(default=0.0, ge=0.0, le=10.0)
+    """Every answer comes so much later."""
+    network: Literal["", "cut", "silent", "reset"] = ""
+    """cut: connections are closed; silent: taken, never answered; reset: reset by the peer."""
+    commands: Literal["", "refused"] = ""
+    """refused: status 503 for velocities alone."""
+    post_ignored: bool = False
+    """As old images do: POST is answered and does nothing, PUT works."""
+    watchdog_s: float = Field(default=ROBOTINO.watchdog_s, gt=0.0, le=5.0)
+    """Time after which the base stops by itself: 0.2 s as documented, 0.5 s in older sources."""
 
 
 class EmulatedRobotino:
@@ -230,11 +250,7 @@ class Handler(BaseHTTPRequestHandler):
 
 
 class RobotinoServer(ThreadingHTTPServer):
-    """Listens for HTTP in front of an emulated Robotino. Use as a context manager.
-
-    Raises:
-        ConfigError: It cannot listen there.
-    """
+    """Listens for HTTP in front of an emulated Robotino; a context manager. Raises ConfigError."""
 
     daemon_threads = True
     block_on_close = False

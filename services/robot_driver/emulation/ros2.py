@@ -6,8 +6,6 @@ closed session takes away: `emulator/faults` (ask, with a JSON object to change 
 `emulator/truth`.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import threading

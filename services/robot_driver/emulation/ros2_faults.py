@@ -1,7 +1,5 @@
 """Faults that an emulated ROS 2 robot can have, changed while it runs."""
 
-from __future__ import annotations
-
 import json
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """The keys, tokens and publishers of an emulated ROS 2 robot on its Zenoh network."""
 
-from __future__ import annotations
-
 import secrets
 import time
 from typing import Literal
@@ -17,11 +15,7 @@ SENSORS = ("odometry", "camera", "bumper", "battery")
 
 
 class Network:
-    """One session of the robot: its keys, tokens and publishers.
-
-    Raises:
-        ConfigError: It cannot listen there.
-    """
+    """One session of the robot: keys, tokens, publishers. Raises ConfigError: it cannot listen."""
 
     def __init__(self, listen: str, ros: Ros2Config, inbox: RawInbox) -> None:
         self._ros, self._inbox = ros, inbox

@@ -1,7 +1,5 @@
 """An emulated base in a simulated world, running by the wall clock in a thread of its own."""
 
-from __future__ import annotations
-
 import threading
 import time
 from dataclasses import asdict, dataclass
@@ -57,13 +55,8 @@ class Counted:
 class EmulatedRobot:
     """A base, its bumper and its camera. All methods may be called from any thread.
 
-    Args:
-        world: Name of the world, such as `plus`; it starts at the first start pose.
-        dynamics: How the base follows commands.
-        robot: Shape of the robot and its camera.
-
-    Raises:
-        ConfigError: There is no such world, or the robot does not fit into it.
+    It begins at the first start pose of the world of this name. Raises ConfigError: there is no
+    such world, or the robot does not fit into it.
     """
 
     def __init__(self, world: str, dynamics: BaseDynamics, robot: RobotConfig) -> None:

@@ -7,8 +7,6 @@ angles counter-clockwise. Stamps are nanoseconds of the robot's clock; 0: none t
 The reason of a BadMessage comes first and is of a small vocabulary, details follow a colon.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -84,8 +82,7 @@ def decode_odometry(data: bytes) -> Stamped[Pose]:
 def decode_camera(data: bytes, kind: CameraType) -> Stamped[RgbImage]:
     """The picture of a sensor_msgs/Image or CompressedImage: uint8 [h, w, 3], RGB.
 
-    Raises:
-        BadMessage: Also for what `picture.py` refuses, and depth images.
+    Raises BadMessage also for what `picture.py` refuses, and depth images.
     """
     message = decode(data, kind)
     if kind == "CompressedImage":

@@ -1,7 +1,5 @@
 """Whether what a sensor sends is new, and when it was made (no clock, no thread)."""
 
-from __future__ import annotations
-
 import math
 from collections import OrderedDict, deque
 

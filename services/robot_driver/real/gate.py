@@ -4,8 +4,6 @@ A velocity is a lease that the driver renews by its own calls. Contact, a lease 
 whatever else forbids motion turn it into standstill here, whoever asked for it.
 """
 
-from __future__ import annotations
-
 import math
 
 from services.robot_driver.robot import STANDSTILL, RobotFault, Velocity
@@ -21,11 +19,7 @@ _TOLERANCE = 1.0 + 1e-9
 
 
 class Gate:
-    """The velocity in force and when it is to be sent.
-
-    Args:
-        config: Limits, period and deadman of the robot.
-    """
+    """The velocity in force and when it is to be sent."""
 
     def __init__(self, config: RobotConfig) -> None:
         self._config = config
@@ -67,8 +61,7 @@ class Gate:
     def drive(self, velocity: Velocity, now_s: float) -> None:
         """Take a velocity from the driver, leased from now on.
 
-        Raises:
-            RobotFault: It is not finite or beyond the limits; the robot is to stand still then.
+        Raises RobotFault: not finite or beyond the limits; the robot is to stand still then.
         """
         config = self._config
         parts = (velocity.forward_m_s, velocity.left_m_s, velocity.turn_rad_s)

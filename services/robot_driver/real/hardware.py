@@ -4,8 +4,6 @@ Three threads touch it: the driver's, one that watches the bumper, and one that 
 asks the `Gate` before every command, so a driver that hangs cannot keep a robot moving.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """One HTTP connection whose every call ends in time, however its answer drips in."""
 
-from __future__ import annotations
-
 import http.client
 import math
 import select

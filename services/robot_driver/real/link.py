@@ -4,8 +4,6 @@ A link has threads or callbacks of its own that put the newest readings into slo
 (`hardware.py`) takes them out, judges their age, and owns every decision about motion.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections import Counter
@@ -139,8 +137,7 @@ class Link(Protocol):
     def send(self, velocity: Velocity) -> None:
         """Send one command, newest wins; returns within a command period.
 
-        Raises:
-            RobotFault: It could not be handed over; a later call may succeed.
+        Raises RobotFault: it could not be handed over; a later call may succeed.
         """
 
     def close(self) -> None:

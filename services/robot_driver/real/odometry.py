@@ -1,7 +1,5 @@
 """What odometry tells: poses that do not jump, and whether a robot moves as told (no clock)."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 

@@ -3,8 +3,6 @@
 One rule for all robots: a picture is whole up to its own end marker, and what follows is ignored.
 """
 
-from __future__ import annotations
-
 import io
 import struct
 import zlib

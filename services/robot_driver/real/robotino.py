@@ -1,7 +1,5 @@
 """A Festo Robotino 3 or 4 over its REST interface: one thread per sensor, newest reading wins."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import logging

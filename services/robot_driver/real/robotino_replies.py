@@ -1,7 +1,5 @@
 """What a Robotino answers, parsed without trust: sizes, types and ranges before use (no socket)."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Any
 

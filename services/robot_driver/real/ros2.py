@@ -5,8 +5,6 @@ robot says counts only while it is fresh: liveliness tokens tell types, never th
 (a cut-off robot's tokens stay for ten seconds).
 """
 
-from __future__ import annotations
-
 import logging
 import secrets
 import threading
@@ -32,11 +30,7 @@ _S_NS = 1_000_000_000
 
 
 class Ros2Link(Ros2Sensors):
-    """A ROS 2 robot as `link.Link`.
-
-    Args:
-        config: `robot.ros2` says where the robot is and what its topics are called.
-    """
+    """A ROS 2 robot as `link.Link`; `robot.ros2` says where it is and how its topics are called."""
 
     def __init__(self, config: Config) -> None:
         super().__init__(config.robot.ros2)
@@ -81,8 +75,7 @@ class Ros2Link(Ros2Sensors):
     def send(self, velocity: Velocity) -> None:
         """Publish one command; motion only where `obstacle` is empty.
 
-        Raises:
-            RobotFault: Also for a stop that was published while nobody is known to listen.
+        Raises RobotFault, also for a stop that was published while nobody is known to listen.
         """
         kind, obstacle = self._velocity_type()
         try:

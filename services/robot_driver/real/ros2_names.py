@@ -5,8 +5,6 @@ Two ways lead there: zenoh-bridge-ros2dds names topics alone, and tells types by
 attachment to every sample (its `docs/design.md` and `attachment_helpers.cpp`).
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

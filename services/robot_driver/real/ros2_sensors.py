@@ -1,7 +1,5 @@
 """What the sensors of a ROS 2 robot send, judged and put into slots (no clock, no network)."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Callable

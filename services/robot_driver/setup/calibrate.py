@@ -1,7 +1,5 @@
 """`corridor robot calibrate`: what a real robot makes of its commands, measured by driving it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from contextlib import closing

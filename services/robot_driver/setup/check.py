@@ -1,7 +1,5 @@
 """`corridor robot check`: every sensor of a real robot, looked at for a while; nothing moves."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -69,11 +67,7 @@ def check(
     clock: Callable[[], float] = time.monotonic,
     wait: Callable[[float], object] = time.sleep,
 ) -> list[str]:
-    """Look at a robot for a while; returns what keeps it from driving.
-
-    Raises:
-        RobotMissing: It cannot be reached.
-    """
+    """Look at a robot for a while; returns what keeps it from driving. Raises RobotMissing."""
     try:
         link.open()
     except RobotFault as error:

@@ -4,8 +4,6 @@ A base waits for its delay, speeds up evenly, then goes on at a steady speed. Th
 of the last part of the way. The delay is the one with which such a base comes closest to the rest.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -31,15 +29,11 @@ class Response(NamedTuple):
 
 
 def response(times_s: Floats, way: Floats, driven_s: float) -> Response:
-    """What a robot made of a command.
+    """What a robot made of a command that was in force for `driven_s`.
 
-    Args:
-        times_s: Of the readings since the command, ascending.
-        way: Metres or radians in the direction of the command, likewise.
-        driven_s: How long the command was in force.
+    times_s: Of the readings since the command, ascending. way: Metres or radians in its direction.
 
-    Raises:
-        ValueError: Too few readings, no way, or no steady speed.
+    Raises ValueError: too few readings, no way, or no steady speed.
     """
     driven = times_s <= driven_s
     times_s, way = times_s[driven], way[driven] - way[0]

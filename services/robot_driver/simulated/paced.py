@@ -1,7 +1,5 @@
 """Simulated time at the pace of the wall clock."""
 
-from __future__ import annotations
-
 import time
 
 from services.robot_driver.simulated.sim import SimRobot

@@ -49,11 +49,7 @@ class _Solid(NamedTuple):
 class Scene:
     """Solid and textured walls and obstacles, a round body to measure with, and a camera.
 
-    Args:
-        world: What to build.
-        radius_m: Radius of the robot's round shell.
-        camera: Height, place, field of view and size of pictures (A1, E31).
-        obstacles: What stands in it; by default what the world begins with.
+    The obstacles are by default what the world begins with; the camera's settings are of A1, E31.
     """
 
     def __init__(
@@ -120,8 +116,7 @@ class Scene:
     def shared(self) -> Scene:
         """The same scene for one more user, to be closed by them; it takes no memory to speak of.
 
-        Raises:
-            ValueError: It is closed.
+        Raises ValueError when it is closed.
         """
         if self not in self._users:
             raise ValueError("a closed scene cannot be shared")

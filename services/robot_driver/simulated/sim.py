@@ -28,8 +28,7 @@ from services.robot_driver.robot import (
     Sensed,
     Velocity,
 )
-from services.robot_driver.simulated.kinematics import advance, wrap
-from services.robot_driver.simulated.lap_counter import LapCounter
+from services.robot_driver.simulated.kinematics import LapCounter, advance, wrap
 from services.robot_driver.simulated.scene import Scene
 from services.robot_driver.simulated.world import World, WorldError, load_world
 from services.robot_driver.simulated.world_parts import Obstacle, Start
@@ -51,13 +50,9 @@ _HALVINGS = 6
 class SimRobot(Robot):
     """A Robotino in a world, as `robot.Robot`; deterministic and without noise.
 
-    Args:
-        config: Shape, camera and limits of the robot.
-        world: Where it drives; it starts at the first start pose.
-        seed: Reserved for worlds with chance in them; motion and camera have none.
+    It begins at the first start pose. `seed` is for worlds with chance in them; there is none yet.
 
-    Raises:
-        ValueError: The start pose touches a wall.
+    Raises ValueError when the start pose touches a wall.
     """
 
     def __init__(self, config: RobotConfig, world: World, seed: int) -> None:
@@ -157,9 +152,7 @@ class SimRobot(Robot):
     def switch(self, world: World, start: int = 0) -> None:
         """Stand still at a start pose of another world; its laps count on from the old ones'.
 
-        Raises:
-            ValueError: There is no such start pose, or it touches something. Nothing has changed
-                then.
+        Raises ValueError: no such start pose, or it touches something. Nothing has changed then.
         """
         world.check_start(start)
         self._show(self._at_start(world, start))

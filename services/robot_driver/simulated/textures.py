@@ -5,8 +5,6 @@ takes the nearest texel: what is finer than a texel would flicker in a 50x75 ima
 Light is painted in: walls are brighter or darker by direction, and darker towards their edges.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable

@@ -6,8 +6,6 @@ windows, notice boards, radiators) are painted onto segments. Obstacles are boxe
 Units are metres and degrees, x to the right and y up on the map.
 """
 
-from __future__ import annotations
-
 import hashlib
 import tomllib
 from collections.abc import Collection
@@ -163,8 +161,7 @@ class World(Part):
     def check_obstacle(self, obstacle: Obstacle) -> None:
         """Whether a box can stand in this world; it may touch or reach into walls.
 
-        Raises:
-            ValueError: It reaches beyond the outermost walls or through the ceiling.
+        Raises ValueError: it reaches beyond the outermost walls or through the ceiling.
         """
         x0, y0, x1, y1 = self.bounds
         slack = 1e-6  # of a box turned against a wall
@@ -250,8 +247,7 @@ class World(Part):
 def world_files() -> dict[str, Path]:
     """All worlds by name: those that come with the driver, then those in the user's `worlds/`.
 
-    Raises:
-        WorldError: One in `worlds/` has a name that is taken.
+    Raises WorldError: one in `worlds/` has a name that is taken.
     """
     files = {path.stem: path for path in sorted(WORLDS.glob("*.toml"))}
     for path in sorted(OWN_WORLDS.glob("*.toml")):
@@ -262,11 +258,7 @@ def world_files() -> dict[str, Path]:
 
 
 def world_path(name: str) -> Path:
-    """The file of a world, given by name or, ending in `.toml`, by path.
-
-    Raises:
-        WorldError: There is none.
-    """
+    """The file of a world, given by name or, ending in `.toml`, by path. Raises WorldError."""
     if name.endswith(".toml"):
         return Path(name)
     files = world_files()
@@ -278,18 +270,13 @@ def world_path(name: str) -> Path:
 def load_world(name: str) -> World:
     """The world of that name: one that comes with the driver, or one in `worlds/`.
 
-    Raises:
-        WorldError: There is none of that name, or its file is wrong.
+    Raises WorldError: there is none of that name, or its file is wrong.
     """
     return read_world(world_path(name))
 
 
 def read_world(path: Path) -> World:
-    """Read and check one world file.
-
-    Raises:
-        WorldError: One line: file, key, what is wrong.
-    """
+    """Read and check one world file. Raises WorldError: one line with file, key, what is wrong."""
     try:
         tree = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:

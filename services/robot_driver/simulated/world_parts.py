@@ -3,8 +3,6 @@
 Units are metres and degrees, x to the right and y up on the map.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Literal, Self
 

@@ -3,8 +3,6 @@
 The configuration reads this file, so it needs the standard library only.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 

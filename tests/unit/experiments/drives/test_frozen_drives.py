@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from experiments.drives import places
-from experiments.drives.choosers import Planned, each, greedy, uniform
+from experiments.drives.choosers import Planned, greedy, uniform
 from experiments.drives.frozen_drives import drive, drive_from_first_start, evaluate
 from experiments.drives.places import CELL_M, Cells, free_cells, reachable, start_poses
 from experiments.drives.traces import first_lap
@@ -19,7 +19,6 @@ from services.robot_driver.robot import Pose
 from services.robot_driver.simulated.world import WORLDS, World, load_world
 from shared.config import Config
 from shared.facts import FORWARD_LEFT
-from shared.messages import Observation
 
 RADIUS_M = Config().robot.radius_m
 NAMES = sorted(path.stem for path in WORLDS.glob("*.toml"))
@@ -126,10 +125,8 @@ def test_coverage_counts_each_free_cell_once() -> None:
 
 
 def test_a_circle_bumps_into_nothing_but_gets_nowhere(env: CorridorEnv) -> None:
-    def left(observation: Observation, draw: np.random.Generator) -> int:
-        return FORWARD_LEFT
-
-    driven = drive(env, each(left), [Pose(4.2, 0.0, math.pi / 2.0)], 120)[0]
+    poses = [Pose(4.2, 0.0, math.pi / 2.0)]
+    driven = drive(env, lambda seen, _: [FORWARD_LEFT] * len(seen), poses, 120)[0]
     assert not driven.bumps.any()
     assert np.ptp(driven.places_m, axis=0) == pytest.approx([0.86, 0.86], abs=0.03)
     assert driven.way_m == pytest.approx(np.full(120, 0.15), rel=0.01)
@@ -151,7 +148,7 @@ def test_drives_depend_on_nothing_but_who_drives(env: CorridorEnv) -> None:
 
 
 def test_recoveries_are_no_way_and_no_runs(env: CorridorEnv) -> None:
-    driven = drive_from_first_start(env, each(lambda observation, draw: 0), 60)
+    driven = drive_from_first_start(env, lambda seen, _: [0] * len(seen), 60)
     assert driven.places_m[0].tolist() == [3.8, 0.0]
     bumped = np.flatnonzero(driven.bumps)
     assert len(bumped)

@@ -78,7 +78,7 @@ def test_pictures_show_way_and_bumps_on_the_map(tmp_path: Path) -> None:
     unmoved = replace(DRIVE, bumps=np.zeros(3, np.bool_), places_m=np.full((4, 2), 3.8))
     pictures = []
     for name, traces in (("one", [DRIVE]), ("two", [DRIVE, unmoved]), ("none", [unmoved])):
-        routes.draw(tmp_path / f"{name}.png", world, traces, name)
+        routes.figure(world, traces, name).savefig(tmp_path / f"{name}.png")
         pictures.append(cv2.imread(str(tmp_path / f"{name}.png")))
     one, _, none = pictures
     assert one.shape[1] == round(routes.WIDTH_IN * routes.DPI)

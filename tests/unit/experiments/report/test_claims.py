@@ -36,7 +36,7 @@ def test_a_figure_may_have_bounds_on_either_side() -> None:
 
 def test_every_figure_that_plans_may_name_can_be_measured() -> None:
     named = get_args(Claim.model_fields["figure"].annotation)
-    assert set(named) == set(claims._FIGURES)
+    assert set(named) == set(claims.TOLD)
     shown = presentations(plan_names())
     claimed = [claim for each in shown.values() for claim in each.claims]
     assert len(claimed) > 10

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from experiments.records import EVALUATION_COLUMNS
-from experiments.report import tables
-from experiments.report.full_report import all_sections
-from experiments.report.overview import overview
+from experiments.report.comparisons import memories
+from experiments.report.full_report import all_sections, overview
+from experiments.report.full_report import test_drives as table_of_test_drives
 from experiments.report.run_folder import load
-from experiments.report.tables import frozen, tours
+from experiments.report.sections import frozen, tours
 from shared.errors import StateError
 from shared.run_record import read_csv, write_csv
 from tests.synthetic_runs import write_run
@@ -79,7 +79,7 @@ def test_every_test_drive_has_a_row_and_a_damaged_file_is_named(tmp_path: Path) 
         ("tour-1", "no", "0", "30 %", "-", "yes"),
         ("tour-2", "no", "2", "62 %", "east-bridge, west-bridge", "no"),
     ]
-    (counted,) = tables.test_drives([experiment]).rows
+    (counted,) = table_of_test_drives([experiment]).rows
     assert counted == ("i16c-test", "tenth", "1", "1 of 3", "2 of 3", "0, 0, 2")
     assert any(getattr(block, "rows", ()) == (counted,) for block in overview([experiment]).blocks)
     section = all_sections([experiment])[-1]
@@ -96,7 +96,7 @@ def test_memories_are_told_of_where_runs_tell(tmp_path: Path) -> None:
     write_run(tmp_path, "plus-normm", 1)
     (found,) = [e for e in load([tmp_path]) if e.name == "plus-rmm"]
     actions = [run.actions / 4500 for run in found.runs]
-    (row,) = tables.memories(load([tmp_path]), "tenth").rows
+    (row,) = memories(load([tmp_path]), "tenth").rows
     assert row[:2] == ("plus-rmm", "1, 2")
     assert row[2].startswith(f"{np.median(actions):.3g}")
     assert row[3:] == ("50 (25 to 75)", "50 (50 to 50)", "0.125 (0.125 to 0.125)")

@@ -15,7 +15,7 @@ from experiments.plans.plan import Plan, read_plan
 from experiments.records import EVALUATION_COLUMNS, WALL_TIME
 from experiments.runs.run import Run
 from experiments.runs.schedule import Job, _distinct, chain, shares_of
-from experiments.runs.watching import Progress
+from experiments.runs.totals import Progress
 from shared import run_record
 from shared.errors import ConfigError, StateError
 

@@ -178,7 +178,7 @@ def test_a_start_without_room_for_one_action_is_shut_in():
 
 
 def test_the_area_that_can_be_reached_is_that_of_the_room_less_a_rim():
-    reach = Reach.of(world(ROOM), 0.3)
+    reach = Reach(world(ROOM), 0.3)
     assert reach.count == 1
     assert reach.area_m2(1) == pytest.approx(5.4 * 3.4, rel=0.02)
     assert reach.size_m(1) == pytest.approx(5.4, abs=0.05)

@@ -11,8 +11,7 @@ import simplejpeg
 from robots import robotino_server
 
 from benchmarks.waiting import wait_until
-from services.robot_driver.emulation.robotino import RobotinoServer
-from services.robot_driver.emulation.robotino_faults import Faults
+from services.robot_driver.emulation.robotino import Faults, RobotinoServer
 from services.robot_driver.emulation.ros2_faults import Ros2Faults
 from services.robot_driver.real.picture import decoded
 from services.robot_driver.real.robotino_replies import odometry

@@ -98,26 +98,3 @@ def test_in_i16c_runs_go_on_for_ever_from_starts_but_not_towards_dead_ends(i16c:
     assert survived.max() < 30
     tour = i16c.drive(starts(i16c.world)[:1], 300)
     assert tour.survived[0] == 300
-
-
-def test_a_planned_tour_drives_the_whole_route_of_minus_and_tells_how_far_it_is():
-    world = load_world("minus")
-    assert world.route is not None
-    planner = Planner(world, GEOMETRY, cell_m=0.1, headings=36, horizon=6)
-    run = planner.tour(110)
-    driven = planner.progress(run.poses[: int(run.survived[0]) + 1, 0])
-    assert driven[0] == 0.0
-    assert driven.max() > 0.95 * world.route.length_m
-    assert np.all(np.diff(driven[:90]) <= GEOMETRY.step_m + 1e-9)
-    assert int(driven.argmax()) >= world.route.length_m / GEOMETRY.step_m - 1
-
-
-def test_progress_along_a_route_is_the_way_to_the_closest_place_on_it(i16c: Planner):
-    poses = np.array([[0.7, 0.3, 0.0], [10.0, -0.2, 1.0], [14.3, 2.0, 0.0], [14.5, 5.0, 0.0]])
-    assert i16c.progress(poses).tolist() == pytest.approx([0.0, 9.3, 15.8, 18.8])
-
-
-def test_worlds_without_route_have_no_tours():
-    planner = Planner(load_world("plus"), GEOMETRY, cell_m=0.5, headings=12, horizon=2)
-    with pytest.raises(ValueError, match="no route"):
-        planner.tour(5)

@@ -11,7 +11,7 @@ Reward `progress` is the environment's own: how far the action led, -1 at a bump
 driving from circling. Reward `distance` comes nearer to ours: how far the robot is from where it
 was 50 actions ago, of the farthest possible.
 
-    python -m experiments.baseline.dqn --like plus-rmm --actions 50000 --seed 1 --out DIR
+    python -m benchmarks.dqn --like plus-rmm --actions 50000 --seed 1 --out DIR
 
 needs Stable-Baselines3 (`make bench-peers` installs it into `.venv-peers`).
 """
@@ -86,7 +86,7 @@ class Dqn:
     """DQN of Stable-Baselines3 as a learner; it has driven the random actions already."""
 
     def __init__(self, config: Config, reward: str) -> None:
-        from experiments.baseline import sb3
+        from benchmarks import sb3
 
         self._sb3 = sb3
         sb3.use_threads(config.numerics.learner.threads)
@@ -199,7 +199,7 @@ def main(
         info = RunInfo(
             experiment=config.run.name, title=f"DQN of Stable-Baselines3, reward {reward}",
             scale=scale, factor=divisor_of(plan, scale), seed=seed, actions=actions,
-            command=f"python -m experiments.baseline.dqn --like {like} --scale {scale} "
+            command=f"python -m benchmarks.dqn --like {like} --scale {scale} "
             f"--reward {reward} --actions {actions} --seed {seed} --starts {starts} "
             f"--drive-actions {drive_actions} --threads {threads}",
             **made_here(), started=now_utc(), stages=(),

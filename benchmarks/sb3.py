@@ -5,6 +5,7 @@ Stable-Baselines3 is no dependency of this project: `make bench-peers` installs 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -15,7 +16,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812  (the customary name)
 
-from experiments.drives.choosers import Chooser, each
+from experiments.drives.choosers import Chooser
 from shared.config import Config, NetworkConfig
 from shared.messages import Observation, image_array
 from shared.rl.network import initialised
@@ -61,11 +62,12 @@ def dqn(env: gymnasium.Env[Any, Any], config: Config, *, random_steps: int, **gi
 def greedy(model: DQN) -> Chooser:
     """The best action by its predictions."""
 
-    def chosen(observation: Observation, draw: np.random.Generator) -> int:  # noqa: ARG001
-        image = image_array(observation.image)[:, :, np.newaxis].copy()  # PyTorch wants to own it
-        return int(model.predict(image, deterministic=True)[0])
+    def chosen(seen: Sequence[Observation], draws: Sequence[np.random.Generator]) -> list[int]:  # noqa: ARG001
+        # A copy of each image: PyTorch wants to own it.
+        images = (image_array(each.image)[:, :, np.newaxis].copy() for each in seen)
+        return [int(model.predict(image, deterministic=True)[0]) for image in images]
 
-    return each(chosen)
+    return chosen
 
 
 def mini_batches(model: DQN) -> int:

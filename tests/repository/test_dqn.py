@@ -11,8 +11,8 @@ import pytest
 from click.testing import Result
 from typer.testing import CliRunner
 
-from experiments.baseline import dqn
-from experiments.baseline.dqn import EVALUATIONS, DistanceReward, shared_config
+from benchmarks import dqn
+from benchmarks.dqn import EVALUATIONS, DistanceReward, shared_config
 from experiments.drives.choosers import Chooser, uniform
 from experiments.environment import CorridorEnv
 from experiments.plans.plan import stage_config

@@ -1,1 +1,0 @@
-"""A baseline: DQN of Stable-Baselines3 in the same corridors."""
