@@ -36,7 +36,9 @@ EVALUATION_COLUMNS = (
     "distance",  # from where it was 50 actions ago, as a part of the farthest possible
     "coverage",  # part of the free cells of the world visited
     "circling",  # part of the time
-    *("wall_value", "value_rank", "value_slope"),  # of older runs; empty now
+    "wall_value",  # of drives that explore: mean prediction of actions that soon hit a wall
+    "value_rank",  # of the same: rank correlation of predictions with observed rewards
+    "value_slope",  # and slope of the rewards over the predictions
     "seconds",  # wall time of learning until then
 )
 WALL_TIME = "seconds"

@@ -1,6 +1,7 @@
 """`corridor evaluate`: what the network of a run can do, beside planner and random actions."""
 
 from collections.abc import Callable, Mapping
+from math import isfinite
 from pathlib import Path
 
 from rich.console import Console
@@ -9,6 +10,7 @@ from rich.table import Table
 from experiments.drives import routes
 from experiments.drives.choosers import Chooser, Planned, greedy, side_by_side, uniform
 from experiments.drives.frozen_drives import evaluate
+from experiments.drives.predictions import prediction_figures
 from experiments.drives.traces import Figures
 from experiments.environment import CorridorEnv
 from experiments.records import EVALUATION_COLUMNS
@@ -31,6 +33,12 @@ SHOWN = {
     "coverage": "free cells visited",
     "circling": "actions spent circling",
 }
+PREDICTED = {
+    "wall_value": "prediction of actions that hit a wall within 6 actions",
+    "value_rank": "rank correlation of predictions with observed rewards",
+    "value_slope": "slope of observed rewards over predictions",
+}
+"""Figures of the network alone, on drives that explore."""
 SHARES = ("distance", "coverage", "circling")
 
 
@@ -44,7 +52,8 @@ def run(path: Path, config: Config, starts: int, actions: int, out: Path) -> Non
         StateError: The network's file is damaged.
     """
     weights = frozen.read(frozen.find(path))
-    network = greedy(weights.predictor(config.network, side_by_side(ActorNumerics())))
+    predictor = weights.predictor(config.network, side_by_side(ActorNumerics()))
+    network = greedy(predictor)
     try:
         env = CorridorEnv(config=config)
     except WorldError as error:
@@ -55,6 +64,8 @@ def run(path: Path, config: Config, starts: int, actions: int, out: Path) -> Non
             ("planner", lambda: Planned(env.world, config.robot)),
         )  # fmt: skip
         found = {name: _drive(env, make, starts, actions, name, out) for name, make in drivers}
+        judged = prediction_figures(env, predictor, starts, actions)
+        found["network"] |= {name: value for name, value in judged.items() if isfinite(value)}
     finally:
         env.close()
     rows = [_row(name, config, weights, figures) for name, figures in found.items()]
@@ -69,8 +80,9 @@ def table(world: str, found: Mapping[str, Figures]) -> Table:
     shown.add_column("figure")
     for driver in found:
         shown.add_column(driver, justify="right")
-    for name, text in SHOWN.items():
-        shown.add_row(text, *(_text(name, each[name]) for each in found.values()))
+    for name, text in (SHOWN | PREDICTED).items():
+        told = (_text(name, each[name]) if name in each else "-" for each in found.values())
+        shown.add_row(text, *told)
     return shown
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from experiments.drives import routes
 from experiments.drives.choosers import greedy, side_by_side
 from experiments.drives.frozen_drives import DRIVERS, drive_from_first_start, evaluate, reference
+from experiments.drives.predictions import prediction_figures
 from experiments.drives.tour import drive_tour
 from experiments.drives.traces import Figures, first_lap
 from experiments.environment import CorridorEnv, with_world
@@ -58,8 +59,17 @@ class Observer:
         rows = []
         for each in (settings.worlds if over else ()) or (world,):
             done = evaluate(self._env(each), greedy(self._network_of_many), starts, actions)
-            rows.append(_row(label, "network", each, done.figures, now))
+            seen = self._predictions(each) if over else {}
+            rows.append(_row(label, "network", each, {**done.figures, **seen}, now))
         append_csv(self._folder / EVALUATIONS, EVALUATION_COLUMNS, rows)
+
+    def _predictions(self, world: str) -> Figures:
+        """How well predictions agree with what follows; without those that cannot be told."""
+        settings = self._plan.evaluation
+        found = prediction_figures(
+            self._env(world), self._network_of_many, settings.every_starts, settings.actions
+        )
+        return {name: value for name, value in found.items() if math.isfinite(value)}
 
     def drives_lap(self, world: str) -> bool:
         """Whether it drives round the lap centre without a bump, from the world's first start.
