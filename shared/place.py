@@ -31,6 +31,15 @@ def is_up(folder: Path) -> bool:
         return False
 
 
+def in_use(folder: Path) -> bool:
+    """Whether a `corridor up` or a single service holds this run folder now.
+
+    Locks of services are looked up: trying one would refuse a service that starts just then.
+    """
+    held, files = Path("/proc/locks").read_text(), (folder / "roles").glob("*.lock")
+    return is_up(folder) or any(f":{path.stat().st_ino} " in held for path in files)
+
+
 def those_up() -> list[Path]:
     """The run folders below `runs/` that are up."""
     return [folder for folder in sorted(RUNS.glob("*")) if is_up(folder)]

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import sys
 
+INTERRUPTED = 130
+"""Exit code after Ctrl-C where nothing was going on that could have ended cleanly."""
+
 
 def main() -> int:
     """Run the command line."""
     first = None
-    if sys.argv[1:2] == ["estop"]:
-        from services.cli import first_stop
-
-        first = first_stop.send(sys.argv[2:])
     try:
+        if sys.argv[1:2] == ["estop"]:
+            from services.cli import first_stop
+
+            first = first_stop.send(sys.argv[2:])
         from services.cli.main import main as rest
 
         return rest(first_halt=first.number if first else None)
+    except KeyboardInterrupt:
+        return INTERRUPTED
     finally:
         if first is not None:
             first.close()

@@ -11,33 +11,49 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
-from services.cli import driving, experiments, machines, run, services
+from services.cli import driving, experiments, looking, machines, run, services
 from services.cli.emulate import emulate
 from services.cli.secure import secure
 from services.cli.worlds import obstacle, world
-from shared.errors import ConfigError, CorridorError
+from shared.errors import ConfigError, CorridorError, meant
 
 UsageError: Any = typer.BadParameter.__mro__[2]
 """Base of all complaints about the command line, wherever this version of Typer keeps Click."""
 
 app = typer.Typer(
-    help="A robot teaches itself to drive through corridors from one camera.",
     epilog="Exit codes: 0 done, 1 crash or no answer, 2 wrong configuration or usage, 3 bad state, "
-    "4 role taken.",
+    "4 role taken, 130 interrupted.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
-for group in (machines, driving, services, run, experiments):
+for group in (machines, driving, services, run, looking, experiments):
     group.add_to(app)
 app.add_typer(world, name="world")
 app.add_typer(obstacle, name="obstacle")
 app.add_typer(emulate, name="emulate")
 app.add_typer(secure, name="secure")
+
+
+def _tell_version(wanted: bool) -> None:
+    if wanted:
+        from shared.provenance import version_of
+
+        typer.echo(f"corridor {version_of('corridor')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _corridor(
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Print the version.", callback=_tell_version, is_eager=True),
+    ] = False,
+) -> None:
+    """A robot teaches itself to drive through corridors from one camera."""
 
 
 def main(arguments: Sequence[str] | None = None, *, first_halt: int | None = None) -> int:
@@ -50,7 +66,12 @@ def main(arguments: Sequence[str] | None = None, *, first_halt: int | None = Non
     except CorridorError as error:
         return _fail(str(error), error.exit_code)
     except UsageError as error:
-        return _fail(error.format_message(), ConfigError.exit_code)
+        text = error.format_message()
+        if bad := re.search(r"'([^']*)' is not one of (.*)\.", text):
+            text = text.removesuffix(".") + meant(bad[1], re.findall(r"'([^']+)'", bad[2]))
+        return _fail(text, ConfigError.exit_code)
+    except typer.Abort:  # nobody answered a question
+        return _fail("not agreed to, nothing was changed", 1)
     return code if isinstance(code, int) else 0
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 from rich.console import Group, RenderableType
@@ -48,6 +48,8 @@ class RunView:
     """What became of the last order given by a key."""
     keys: bool = False
     """Whether keys are read."""
+    commanded: Collection[str] = ()
+    """Robots that somebody else than the run's actor commands."""
 
 
 # ---------------------------------------------------------------- words
@@ -73,6 +75,8 @@ def _robot_warnings(view: RunView) -> Iterator[str]:
             yield f"robot {name}: paused, let it go on by `corridor resume`"
         if seen.message.reason:
             yield f"robot {name}: stands still: {seen.message.reason}"
+        if name in view.commanded:
+            yield f"robot {name}: the actor gave way to `corridor drive` or another commander"
 
 
 def _child_warnings(view: RunView) -> Iterator[str]:
@@ -89,7 +93,8 @@ def _child_warnings(view: RunView) -> Iterator[str]:
 
 def _silences(view: RunView) -> Iterator[str]:
     for name, seen in view.snapshot.everybody.items():
-        if seen.age_s > 3 * view.heartbeat_s:
+        gave_way = name.removeprefix("actor of ") in view.commanded
+        if seen.age_s > 3 * view.heartbeat_s and not gave_way:
             yield f"{name}: silent for {seen.age_s:.0f} s"
 
 

@@ -1,0 +1,118 @@
+"""What lies under `runs/`: which runs there are, how far each came, and what of it may go."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from services.monitor.running import locked
+from shared.config import Config
+from shared.errors import ConfigError
+from shared.place import RUNS, in_use
+from shared.run_record import RUN, SERVICES, RunInfo, read_episodes
+from shared.settings import flatten, read_folder
+
+ANEW = ("tensorboard", "logs/*.[0-9]")
+"""What may go: TensorBoard's numbers stand in the tables, too, and these logs are old."""
+WRITTEN_S = 300.0
+"""An experiment that wrote something within this time goes on."""
+
+
+def found(folders: Sequence[Path]) -> list[Path]:
+    """The runs in these folders and below them, or below `runs/`. Raises ConfigError."""
+    runs = []
+    for top in folders or [RUNS]:
+        inside = sorted(path.parent for n in range(4) for path in top.glob("*/" * n + RUN))
+        if folders and not inside:
+            raise ConfigError(f"{top}: expected the folder of a run, with {RUN}; found none")
+        runs += inside
+    return list(dict.fromkeys(runs))
+
+
+def figures(folder: Path) -> dict[str, Any]:
+    """The main figures of a run. Raises OSError or ValueError where it is damaged."""
+    info, rows = RunInfo.model_validate_json((folder / RUN).read_bytes()), read_episodes(folder)
+    last: Mapping[str, str] = rows[-1] if rows else {}
+    fitness = [float(row["fitness"]) for row in rows[-100:]]
+    preset = re.search(r"--preset[ =](\S+)", info.command)
+    young = time.time() - folder.stat().st_mtime < WRITTEN_S
+    going_on = in_use(folder) or (young and info.scale != SERVICES and not info.complete)
+    return {
+        "plan": info.experiment,
+        "scale": info.scale,
+        "seed": info.seed,
+        "preset": preset[1] if preset else "-",
+        "episodes": len(rows),
+        "actions": last.get("total_actions", 0),
+        "fitness": f"{sum(fitness) / len(fitness):.1f}" if fitness else "-",
+        "laps": f"{last.get('laps_left', 0)} left {last.get('laps_right', 0)} right",
+        "size": _megabytes([folder]),
+        "state": "up" if going_on else "complete" if info.complete else "stopped",
+        "started": info.started,
+    }
+
+
+def listing(runs: Sequence[Path]) -> Table:
+    """All runs, one a line; one that is damaged says so."""
+    table = Table(box=None, pad_edge=False)
+    for run in runs:
+        try:
+            told = figures(run)
+        except (OSError, ValueError) as error:
+            told = {"plan": f"damaged: {str(error).splitlines()[0]:.60}"}
+        for column in list({"run": "", **told})[len(table.columns) :]:
+            table.add_column(column)
+        table.add_row(str(run), *map(str, told.values()))
+    return table
+
+
+def side_by_side(runs: Sequence[Path]) -> Table:
+    """Settings that differ, of a run alone from the defaults; records, newest and main figures."""
+    table = Table("", *map(str, runs), box=None, pad_edge=False)
+    settings = [flatten(read_folder(run).to_dict()) for run in runs]
+    others = settings if len(runs) > 1 else [flatten(Config().to_dict())]
+    differ = [key for key in settings[0] if any(s[key] != o[key] for s in settings for o in others)]
+    records = [RunInfo.model_validate_json((run / RUN).read_bytes()).model_dump() for run in runs]
+    newest = [(read_episodes(run) or [{}])[-1] for run in runs]
+    for trees in (settings, records, newest, list(map(figures, runs))):
+        for key in differ if trees is settings else trees[0]:
+            table.add_row(key, *(str(tree.get(key, "")) for tree in trees))
+    return table
+
+
+def prune(
+    runs: Sequence[Path], whole: bool, agreed: Callable[[str], bool], echo: Callable[[str], None]
+) -> bool:
+    """Remove what can be spared, or whole runs, once that is agreed to; whether it was.
+
+    No run in use is touched, and none can be started meanwhile.
+    """
+    with ExitStack() as held:
+        going: list[Path] = []
+        for run in runs:
+            if figures(run)["state"] == "up":
+                echo(f"{run}: up, left alone")
+                continue
+            held.enter_context(locked(run))
+            going += [run] if whole else [path for each in ANEW for path in run.glob(each)]
+        echo("\n".join(f"{path}: {_megabytes([path])}" for path in going) or "nothing to remove")
+        freed = _megabytes(going)
+        if going and not agreed(f"remove these {len(going)}, {freed}?"):
+            return False
+        for path in going:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    echo(f"{freed} freed")
+    return True
+
+
+def _megabytes(paths: Sequence[Path]) -> str:
+    """What files and folders take on disk; holes take nothing."""
+    every = (each for path in paths for each in (path, *path.rglob("*")))
+    return f"{sum(each.lstat().st_blocks * 512 for each in every) / 1e6:.1f} MB"
