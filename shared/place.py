@@ -8,9 +8,11 @@ router of that run listens and, in its second line, which folder of credentials 
 from __future__ import annotations
 
 import fcntl
+import time
 from pathlib import Path
 
 RUNS = Path("runs")
+WRITTEN_S = 180.0
 
 
 def try_lock(descriptor: int, kind: int) -> bool:
@@ -32,12 +34,14 @@ def is_up(folder: Path) -> bool:
 
 
 def in_use(folder: Path) -> bool:
-    """Whether a `corridor up` or a single service holds this run folder now.
+    """Whether a `corridor up`, a single service or an experiment works in this run folder now.
 
     Locks of services are looked up: trying one would refuse a service that starts just then.
+    Experiments have none, but write once a minute.
     """
-    held, files = Path("/proc/locks").read_text(), (folder / "roles").glob("*.lock")
-    return is_up(folder) or any(f":{path.stat().st_ino} " in held for path in files)
+    held, files = Path("/proc/locks").read_text(), [*(folder / "roles").glob("*.lock")]
+    young = not files and time.time() - folder.stat().st_mtime < WRITTEN_S
+    return is_up(folder) or young or any(f":{path.stat().st_ino} " in held for path in files)
 
 
 def those_up() -> list[Path]:

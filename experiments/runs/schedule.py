@@ -93,8 +93,10 @@ def run_experiment(
         ProcessPoolExecutor(jobs, context, _begin, (reports, stop, shares)) as pool,
         _bars(console) as bars,
     ):
+        signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)  # workers inherit it, and start in peace
         futures = [pool.submit(_work, piece) for piece in pieces]
         try:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
             _watch(futures, reports, bars)
         except KeyboardInterrupt:
             console.print("stopping after the current turns; the same command goes on")

@@ -12,6 +12,11 @@ def main() -> int:
     """Run the command line."""
     first = None
     try:
+        if sys.argv[1:] == ["--version"]:
+            from shared.provenance import version_of
+
+            sys.stdout.write(f"corridor {version_of('corridor')}\n")
+            return 0
         if sys.argv[1:2] == ["estop"]:
             from services.cli import first_stop
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
@@ -25,8 +25,9 @@ UsageError: Any = typer.BadParameter.__mro__[2]
 """Base of all complaints about the command line, wherever this version of Typer keeps Click."""
 
 app = typer.Typer(
+    help="A robot teaches itself to drive through corridors from one camera.",
     epilog="Exit codes: 0 done, 1 crash or no answer, 2 wrong configuration or usage, 3 bad state, "
-    "4 role taken, 130 interrupted.",
+    "4 role taken, 130 interrupted. `corridor --version` prints the version.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
@@ -36,24 +37,6 @@ app.add_typer(world, name="world")
 app.add_typer(obstacle, name="obstacle")
 app.add_typer(emulate, name="emulate")
 app.add_typer(secure, name="secure")
-
-
-def _tell_version(wanted: bool) -> None:
-    if wanted:
-        from shared.provenance import version_of
-
-        typer.echo(f"corridor {version_of('corridor')}")
-        raise typer.Exit
-
-
-@app.callback()
-def _corridor(
-    version: Annotated[
-        bool,
-        typer.Option("--version", help="Print the version.", callback=_tell_version, is_eager=True),
-    ] = False,
-) -> None:
-    """A robot teaches itself to drive through corridors from one camera."""
 
 
 def main(arguments: Sequence[str] | None = None, *, first_halt: int | None = None) -> int:
@@ -68,10 +51,10 @@ def main(arguments: Sequence[str] | None = None, *, first_halt: int | None = Non
     except UsageError as error:
         text = error.format_message()
         if bad := re.search(r"'([^']*)' is not one of (.*)\.", text):
-            text = text.removesuffix(".") + meant(bad[1], re.findall(r"'([^']+)'", bad[2]))
+            text += meant(bad[1], re.findall(r"'([^']+)'", bad[2]))
         return _fail(text, ConfigError.exit_code)
     except typer.Abort:  # nobody answered a question
-        return _fail("not agreed to, nothing was changed", 1)
+        return _fail("nothing was changed", 1)
     return code if isinstance(code, int) else 0
 
 

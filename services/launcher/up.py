@@ -54,36 +54,26 @@ def run_all(
             raise ConfigError(f"--listen: bus.endpoint {config.bus.endpoint!r} was given, too")
         refuse_open_door(listen, config.bus.credentials, insecure)
     own = None if given else listen or free_endpoint()
-    bus = config.bus.model_copy(update={"endpoint": reachable(own) if own else config.bus.endpoint})
-    stored, config = settings.claim(folder, config), config.model_copy(update={"bus": bus})
+    endpoint = reachable(own) if own else config.bus.endpoint
+    stored = settings.claim(folder, config)
     with locked(folder) as lock, stop_on_signals() as stop:
-        tell(f"run {stored.run.name} is starting")
         run_record.begin(folder, stored)
-        settle_all(stored, folder, tell=tell, stopped=stop.is_set)  # while nothing else runs
-        ending = Ending(0, "stopped before the services were started")
+        # Now, while nothing else runs.
+        settle_all(stored, folder, tell=lambda line: say(line, 1), stopped=stop.is_set)
+        bus = config.bus.model_copy(update={"endpoint": endpoint})
+        config = config.model_copy(update={"bus": bus})
+        credentials = Path(bus.credentials).absolute() if bus.credentials else ""
+        write_atomically(folder / "endpoint", f"{endpoint}\n{credentials}\n".encode())
+        setup_logging("up", folder, screen=False)  # the terminal belongs to the display
+        specs = child_specs(config, stored, folder, own)
+        environment = {k: v for k, v in os.environ.items() if not k.startswith(settings.ENV_PREFIX)}
+        supervisor = Supervisor(specs, folder / "logs", environment, [lock])
+        ending = Ending(0, "all stopped")
         if not stop.is_set():
-            ending = _run(config, stored, folder, own, lock, stop)
+            ending = supervise(config, supervisor, stop)
     text = ending.reason if ending.code else f"{ending.reason}; the run lies in {folder}"
     say(f"corridor: {text}", 2 if ending.code else 1)
     return ending.code
-
-
-def tell(line: str) -> None:
-    """Say what goes on before there is a live view."""
-    say(f"corridor: {line}", 1)
-
-
-def _run(
-    config: Config, stored: Config, folder: Path, own: str | None, lock: int, stop: threading.Event
-) -> Ending:
-    """Start the processes and keep them running; own: where our router listens, if there is one."""
-    credentials = Path(config.bus.credentials).absolute() if config.bus.credentials else ""
-    endpoint = f"{config.bus.endpoint}\n{credentials}\n"
-    write_atomically(folder / "endpoint", endpoint.encode())
-    setup_logging("up", folder, screen=False)  # the terminal belongs to the display
-    specs = child_specs(config, stored, folder, own)
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(settings.ENV_PREFIX)}
-    return supervise(config, Supervisor(specs, folder / "logs", environment, [lock]), stop)
 
 
 def supervise(config: Config, supervisor: Supervisor, stop: threading.Event) -> Ending:

@@ -111,7 +111,7 @@ def _training(seen: Evidence) -> Told:
     learning, steps = seen.config.learning, seen.newest("train_steps", 10 * RECENT)
     every = 1.0 if learning.mini_batches_per_episode else float(learning.fit_every or np.inf)
     if learning.fit_every_actions and every > 1.0 and len(steps):
-        every = max(1.0, learning.fit_every_actions / np.mean(seen.newest("actions")))
+        every = max(1.0, learning.fit_every_actions / float(np.mean(seen.newest("actions"))))
     patience = 3 * every + 10 + 20 * (learning.mode == "asynchronous")
     grew = np.flatnonzero(np.diff(np.fmax.accumulate(np.nan_to_num(steps))) > 0)
     idle = len(steps) - 2 - (int(grew[-1]) if len(grew) else -1)
@@ -119,7 +119,7 @@ def _training(seen: Evidence) -> Told:
     yield alone and idle >= patience, "learner stopped", f"no training for {idle} episodes"
     allowed = 0 if learning.mode == "synchronous" else learning.max_lag_episodes
     behind = seen.newest("weights_version", 11)[:-1] - seen.newest("acting_version", 11)[1:]
-    old = np.nan_to_num(behind).min(initial=np.inf)
+    old = float(np.nan_to_num(behind).min(initial=np.inf))
     yield len(behind) == 10 and old > allowed, "weights stale", f"they are {old:.0f} versions old"
     age = seen.last("target_age")
     yield age > RECENT, "weights stale", f"the target network is {age:.0f} episodes old"
@@ -137,7 +137,7 @@ def _losses(seen: Evidence) -> Told:
     text = f"loss {loss:.3g} by learning.learning_rate {seen.config.learning.learning_rate:g}"
     yield high, "learning rate too high", (diverged or [text])[-1]
     flat = not high and loss > 0.9 * constant > 0.0 and seen.last("train_steps") >= 300
-    yield flat, "loss does not fall", f"loss {loss:.3f}, a constant reaches {constant:.3f}"
+    yield bool(flat), "loss does not fall", f"loss {loss:.3f}, a constant reaches {constant:.3f}"
 
 
 def _driven(seen: Evidence) -> Told:
@@ -160,11 +160,11 @@ def _driven(seen: Evidence) -> Told:
 def _memory(seen: Evidence) -> Told:
     """What is kept, what goes, and what becomes of rewards."""
     memory, capacity = seen.config.memory, seen.last("capacity")
-    driven, brought, gone, by_age, times = (
+    driven, gone, by_age, times = (
         float(np.nansum(seen.newest(name)))
-        for name in ("actions", "samples", "discarded", "last_resort", "equalised")
+        for name in ("actions", "discarded", "last_resort", "equalised")
     )
-    lost = 1 - brought / max(driven, 500)
+    lost = 1 - float(seen.newest("samples").sum()) / max(driven, 500)
     yield lost > 0.2 and driven > 500, "samples lost", f"{lost:.0%} of {driven:.0f} actions"
     threshold = seen.last("threshold_percent")
     capped = threshold >= memory.threshold_max_percent > memory.threshold_percent

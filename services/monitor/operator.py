@@ -84,18 +84,16 @@ def change_world(config: Config, robot: str | None, **change: Any) -> int:
             raise PeerMissing(
                 f"no robot of run {config.run.name!r} answers at {config.bus.endpoint}"
             )
-        done = [_change_world(bus, name, message, meant(name, present)) for name in names]
+        done = [_change_world(bus, name, message, present) for name in names]
         return 0 if all(done) else 1
 
 
-def _change_world(bus: Bus, name: str, message: WorldChange, hint: str) -> bool:
-    """Tell one robot of a wish and print its answer; whether it accepted.
-
-    hint: what stands behind the line that tells that nobody answers.
-    """
+def _change_world(bus: Bus, name: str, message: WorldChange, present: Sequence[str]) -> bool:
+    """Tell one robot of a wish and print its answer; whether it accepted."""
     try:
         answer = _ask(bus, ROBOT_WORLD, message, WorldChanged, name)
     except (BusError, BadMessage) as error:
+        hint = meant(name, present)
         typer.echo(f"{name}: no answer to {message.kind}: {error}{hint}", err=True)
         return False
     if not answer.accepted:
@@ -125,11 +123,9 @@ def stop_services(config: Config, services: Sequence[str]) -> int:
         peers = [p for p in there if not services or p.service in services]
         if not peers:
             wanted = " or ".join(services) or "service"
+            text = f"no {wanted} of run {config.run.name!r} at {config.bus.endpoint}"
             known = {peer.service for peer in there} | BY_NAME.keys()
-            raise PeerMissing(
-                f"no {wanted} of run {config.run.name!r} at {config.bus.endpoint}"
-                + "".join(meant(name, known) for name in services)
-            )
+            raise PeerMissing(text + "".join(meant(name, known) for name in services))
         for peer in sorted(peers, key=_stop_place):
             try:
                 _ask(bus, STOP, StopService(), ServiceReply, f"{peer.service}-{peer.id}")

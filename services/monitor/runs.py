@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import re
 import shutil
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 from rich.table import Table
 
 from services.monitor.running import locked
 from shared.config import Config
-from shared.errors import ConfigError
+from shared.errors import ConfigError, StateError
 from shared.place import RUNS, in_use
-from shared.run_record import RUN, SERVICES, RunInfo, read_episodes
+from shared.run_record import RUN, RunInfo, read_episodes
 from shared.settings import flatten, read_folder
 
 ANEW = ("tensorboard", "logs/*.[0-9]")
 """What may go: TensorBoard's numbers stand in the tables, too, and these logs are old."""
-WRITTEN_S = 300.0
-"""An experiment that wrote something within this time goes on."""
 
 
 def found(folders: Sequence[Path]) -> list[Path]:
@@ -36,27 +32,30 @@ def found(folders: Sequence[Path]) -> list[Path]:
     return list(dict.fromkeys(runs))
 
 
-def figures(folder: Path) -> dict[str, Any]:
-    """The main figures of a run. Raises OSError or ValueError where it is damaged."""
-    info, rows = RunInfo.model_validate_json((folder / RUN).read_bytes()), read_episodes(folder)
-    last: Mapping[str, str] = rows[-1] if rows else {}
-    fitness = [float(row["fitness"]) for row in rows[-100:]]
+def read(folder: Path) -> tuple[RunInfo, list[dict[str, str]]]:
+    """Record and episodes of a run. Raises StateError where they are damaged."""
+    try:
+        return RunInfo.model_validate_json((folder / RUN).read_bytes()), read_episodes(folder)
+    except (OSError, ValueError) as error:
+        raise StateError(f"{folder}: damaged: {str(error).splitlines()[0]:.60}") from error
+
+
+def figures(folder: Path) -> dict[str, object]:
+    """The main figures of a run. Raises StateError."""
+    info, rows = read(folder)
     preset = re.search(r"--preset[ =](\S+)", info.command)
-    young = time.time() - folder.stat().st_mtime < WRITTEN_S
-    going_on = in_use(folder) or (young and info.scale != SERVICES and not info.complete)
+    fitness = [float(row["fitness"]) for row in rows[-100:]]
+    left, right, actions = (
+        rows[-1][name] if rows else "0" for name in ("laps_left", "laps_right", "total_actions")
+    )
     return {
-        "plan": info.experiment,
-        "scale": info.scale,
-        "seed": info.seed,
-        "preset": preset[1] if preset else "-",
-        "episodes": len(rows),
-        "actions": last.get("total_actions", 0),
+        "plan": info.experiment, "scale": info.scale, "seed": info.seed,
+        "preset": preset[1] if preset else "-", "episodes": len(rows), "actions": actions,
         "fitness": f"{sum(fitness) / len(fitness):.1f}" if fitness else "-",
-        "laps": f"{last.get('laps_left', 0)} left {last.get('laps_right', 0)} right",
-        "size": _megabytes([folder]),
-        "state": "up" if going_on else "complete" if info.complete else "stopped",
+        "laps": f"{left} left {right} right", "size": _megabytes([folder]),
+        "state": "complete" if info.complete else "up" if in_use(folder) else "stopped",
         "started": info.started,
-    }
+    }  # fmt: skip
 
 
 def listing(runs: Sequence[Path]) -> Table:
@@ -65,8 +64,8 @@ def listing(runs: Sequence[Path]) -> Table:
     for run in runs:
         try:
             told = figures(run)
-        except (OSError, ValueError) as error:
-            told = {"plan": f"damaged: {str(error).splitlines()[0]:.60}"}
+        except StateError as error:
+            told = {"plan": str(error)}
         for column in list({"run": "", **told})[len(table.columns) :]:
             table.add_column(column)
         table.add_row(str(run), *map(str, told.values()))
@@ -79,8 +78,8 @@ def side_by_side(runs: Sequence[Path]) -> Table:
     settings = [flatten(read_folder(run).to_dict()) for run in runs]
     others = settings if len(runs) > 1 else [flatten(Config().to_dict())]
     differ = [key for key in settings[0] if any(s[key] != o[key] for s in settings for o in others)]
-    records = [RunInfo.model_validate_json((run / RUN).read_bytes()).model_dump() for run in runs]
-    newest = [(read_episodes(run) or [{}])[-1] for run in runs]
+    records = [read(run)[0].model_dump() for run in runs]
+    newest = [(read(run)[1] or [{}])[-1] for run in runs]
     for trees in (settings, records, newest, list(map(figures, runs))):
         for key in differ if trees is settings else trees[0]:
             table.add_row(key, *(str(tree.get(key, "")) for tree in trees))
@@ -95,14 +94,13 @@ def prune(
     No run in use is touched, and none can be started meanwhile.
     """
     with ExitStack() as held:
-        going: list[Path] = []
-        for run in runs:
-            if figures(run)["state"] == "up":
-                echo(f"{run}: up, left alone")
-                continue
+        up = {run: f"{run}: up, left alone" for run in runs if in_use(run)}
+        for run in (free := [run for run in runs if run not in up]):
             held.enter_context(locked(run))
-            going += [run] if whole else [path for each in ANEW for path in run.glob(each)]
-        echo("\n".join(f"{path}: {_megabytes([path])}" for path in going) or "nothing to remove")
+        spared = [path for run in free for each in ANEW for path in run.glob(each)]
+        going = free if whole else spared
+        for line in (*up.values(), *(f"{path}: {_megabytes([path])}" for path in going)):
+            echo(line)
         freed = _megabytes(going)
         if going and not agreed(f"remove these {len(going)}, {freed}?"):
             return False

@@ -89,7 +89,7 @@ def content(name: str, sender: str, payload: bytes) -> str:
 
 
 def watch(config: Config, action: str, name: str, seconds: float) -> None:
-    """Show all streams (top), or rate (hz) or messages (echo) of one, until Ctrl-C or so long.
+    """Show rates of all streams or of one, or its messages (echo), until Ctrl-C or so long.
 
     Raises ConfigError for a stream that cannot be watched, RouterMissing.
     """
@@ -104,14 +104,14 @@ def watch(config: Config, action: str, name: str, seconds: float) -> None:
             bus.subscribe(PUBLISHED[each], "*", partial(gauge.note, each))
         start_s = time.monotonic()
         while not stop.wait(PERIOD_S):
-            if action == "top":
+            if action == "echo":
+                for line in gauge.news():
+                    console.print(line, soft_wrap=True)
+            else:
                 table = Table(*COLUMNS, box=None, pad_edge=False, caption=NOT_SHOWN)
                 for row in gauge.rows():
                     table.add_row(*row)
                 console.clear()  # of a terminal only
                 console.print(table)
-            for line in gauge.news() if action == "echo" else map(" ".join, gauge.rows()):
-                if action != "top":
-                    console.print(line, soft_wrap=True)
             if seconds and time.monotonic() - start_s >= seconds:
                 return

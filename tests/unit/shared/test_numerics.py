@@ -187,6 +187,22 @@ def test_an_accelerator_that_fails_is_left_out_and_named_once(
     ]
 
 
+def test_it_tells_what_it_measures_and_ends_at_once_when_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = (sys.executable, "-S", "-c", BROKEN.format(ends="time.sleep(60)"))
+    monkeypatch.setattr(numerics, "COMMAND", command)
+    monkeypatch.setattr(numerics, "NEWS_S", 0.0)
+    told: list[str] = []
+    tried = "actor, openvino"
+    numerics.settle_all(
+        UNSETTLED, tmp_path, tell=told.append, stopped=lambda: tried in told[-1] if told else False
+    )
+    assert "loading libraries" in told[0]
+    assert tried in told[-1]
+    assert not list(tmp_path.iterdir())
+
+
 def test_what_fails_without_an_accelerator_is_told_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -26,6 +26,8 @@ def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
         run_record.write_csv(
             folder / "episodes.csv", run_record.EPISODE_COLUMNS, [{**row, "seconds": 1.0}]
         )
+        (folder / "roles").mkdir()
+        (folder / "roles" / "replay-main.lock").touch()
         (folder / "tensorboard").mkdir()
         (folder / "tensorboard" / "events.1").write_bytes(bytes(100_000))
         (folder / "logs").mkdir()
@@ -37,7 +39,7 @@ def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
 def test_runs_are_listed_with_their_figures(
     folders: list[Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("COLUMNS", "300")
     (folders[1] / "run.json").write_text("{}")
     with locked(folders[0]):
         assert cli.main(["runs"]) == 0
@@ -51,7 +53,7 @@ def test_runs_are_listed_with_their_figures(
 def test_one_is_shown_against_the_defaults_and_two_against_each_other(
     folders: list[Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("COLUMNS", "300")
     assert cli.main(["runs", "show", str(folders[0])]) == 0
     shown = capsys.readouterr().out
     for part in ("memory.capacity", "4000", "commit", "total_actions", "fitness"):
