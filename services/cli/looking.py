@@ -18,10 +18,7 @@ def add_to(app: typer.Typer) -> None:
 
 
 def diagnose(
-    run: Annotated[
-        Path | None,
-        typer.Argument(metavar="[RUN]", help="Folder; default: the run that is up, or runs/demo."),
-    ] = None,
+    run: Annotated[Path | None, typer.Argument(help="Default: what is up, or runs/demo.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON array.")] = False,
 ) -> None:
     """Tell why a run does not learn: what was measured, what is usual, what to do.
@@ -48,9 +45,11 @@ def diagnose(
     else:
         blind = "" if memory else ", no replay memory: camera and actions are not judged"
         typer.echo(f"{folder}: {len(episodes)} episodes, {'' if live else 'not '}up{blind}")
-        for each in found:
-            typer.echo(f"{each.illness}: {each.measured}\n    usual: {each.usual}")
-            typer.echo(f"    what to do: {each.remedy}")
+        for it in found:
+            told = (
+                f"{it.illness}: {it.measured}\n    usual: {it.usual}\n    what to do: {it.remedy}"
+            )
+            typer.echo(told)
         typer.echo(f"{len(found)} found" if found else "nothing found")
     raise typer.Exit(1 if found else 0)
 
@@ -63,13 +62,8 @@ def _logged(folder: Path) -> list[str]:
 
 
 def runs(
-    action: Annotated[
-        Literal["list", "show", "compare", "prune"], typer.Argument(help="What to do.")
-    ] = "list",
-    folders: Annotated[
-        list[Path] | None,
-        typer.Argument(metavar="[RUN]...", help="Folders of runs, or above them; default: runs."),
-    ] = None,
+    action: Annotated[Literal["list", "show", "compare", "prune"], typer.Argument()] = "list",
+    folders: Annotated[list[Path] | None, typer.Argument(help="Default: all below runs.")] = None,
     whole: Annotated[bool, typer.Option("--whole", help="prune: whole runs.")] = False,
     yes: Annotated[bool, typer.Option("--yes", help="prune: do not ask.")] = False,
 ) -> None:
@@ -95,14 +89,14 @@ def runs(
 
 def streams(
     which: Which,
-    action: Annotated[
-        Literal["top", "hz", "echo"],
-        typer.Argument(help="top: all streams; hz: rates of one; echo: its messages, as JSON."),
-    ] = "top",
-    name: Annotated[str, typer.Argument(metavar="[STREAM]", help="Such as observation.")] = "",
+    action: Annotated[Literal["top", "hz", "echo"], typer.Argument()] = "top",
+    stream: Annotated[str, typer.Argument(help="Such as observation.")] = "",
     seconds: Annotated[float, typer.Option(min=0.0, help="End after so long; 0: at Ctrl-C.")] = 0.0,
 ) -> None:
-    """Watch what is published: rate, size, age and content of every stream, once a second."""
+    """Watch what is published, once a second: top shows rate, size, age and content of all.
+
+    hz shows those of one stream, echo prints its messages as JSON.
+    """
     from services.monitor.streams import watch
 
-    watch(which.reach(), action, name, seconds)
+    watch(which.reach(), action, stream, seconds)

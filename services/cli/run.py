@@ -84,14 +84,8 @@ def up(
             loaded.robot.world
         )
 
-    code = run_all(
-        loaded,
-        run_dir or default_folder(loaded),
-        listen=listen,
-        given=endpoint is not None,
-        insecure=insecure,
-    )
-    raise typer.Exit(code)
+    folder, given = run_dir or default_folder(loaded), endpoint is not None
+    raise typer.Exit(run_all(loaded, folder, listen=listen, given=given, insecure=insecure))
 
 
 def status(

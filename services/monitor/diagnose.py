@@ -28,7 +28,6 @@ RECENT, LEAST = 100, 30
 """Newest episodes that are looked at; fewer than the latter tell little."""
 PICTURES, DRIVEN = 400, 2000
 """Newest samples of which pictures, and of which actions and places, are looked at."""
-SILENT_S = 5.0
 Told = Iterator[tuple[bool, str, str]]
 """Whether an illness is there, its name, and what was measured."""
 
@@ -45,16 +44,17 @@ class Finding:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known of a run."""
+    """What is known of a run.
+
+    live: heartbeats of one that is up, once every service had the time to send one. log: what
+    replay and learner logged since they started.
+    """
 
     config: Config
     episodes: Sequence[Mapping[str, str]] = ()
-    """`run_record.read_episodes`."""
     memory: ReplayMemory | None = None
     live: Snapshot | None = None
-    """Heartbeats of a run that is up, once every service had the time to send one."""
     log: Sequence[str] = ()
-    """What replay and learner logged since they started."""
 
     def newest(self, column: str, count: int = RECENT) -> npt.NDArray[np.float64]:
         """The newest values of a column; NaN where nothing stands."""
@@ -70,82 +70,44 @@ class Evidence:
 def findings(seen: Evidence) -> list[Finding]:
     """Everything that is found, causes before what follows from them."""
     texts = tomllib.loads(Path(__file__).with_name("illnesses.toml").read_text())
-    told = [each for check in CHECKS for each in check(seen)]
+    told = [*_live(seen), *_samples(seen), *_training(seen), *_kept(seen), *_driving(seen)]
     return [Finding(name, measured, **texts[name]) for there, name, measured in told if there]
 
 
 def _live(seen: Evidence) -> Told:
-    live, refused = seen.live, [line for line in seen.log if " is refused: " in line]
-    count, why = len(refused), (refused or ["see logs/replay.log"])[-1].split(" is refused: ")[-1]
-    if live is not None:
-        for name, heard in (("learner", live.learner), ("replay", live.replay)):
-            silent_s = heard.age_s if heard else np.inf
-            silent = silent_s > max(3 * seen.config.bus.heartbeat_s, SILENT_S)
-            yield silent, f"{name} stopped", f"silent for {silent_s:.0f} s"
-        for name, robot in live.robots.items():
-            stands = robot.message.state in ("estop", "paused", "blocked")
-            yield stands, "robot stands", f"{name}: {robot.message.state} {robot.message.reason}"
-        lost = [actor.message.refused_episodes for actor in live.actors.values()]
-        count = max([count, *lost, live.replay.message.refused if live.replay else 0])
+    refused, live = [line for line in seen.log if " is refused: " in line], seen.live or Snapshot()
+    for name, heard in (("learner", live.learner), ("replay", live.replay)):
+        silent = heard is None or heard.age_s > 2.0 + 3 * seen.config.bus.heartbeat_s
+        measured = f"silent for {heard.age_s:.0f} s" if heard else "not heard"
+        yield silent and seen.live is not None, f"{name} stopped", measured
+    for name, robot in live.robots.items():
+        stands = robot.message.state in ("estop", "paused", "blocked")
+        yield stands, "robot stands", f"{name}: {robot.message.state} {robot.message.reason}"
+    lost = [actor.message.refused_episodes for actor in live.actors.values()]
+    count = max([len(refused), *lost, live.replay.message.refused if live.replay else 0])
+    why = (refused or ["see logs/replay.log"])[-1].split(" is refused: ")[-1]
     yield count > 0, "samples refused", f"{count} episodes, the last one because of {why}"
 
 
-def _camera(seen: Evidence) -> Told:
-    memory = seen.memory
+def _samples(seen: Evidence) -> Told:
+    """What the newest pictures, actions and places tell."""
+    memory, horizon = seen.memory, seen.config.episode.horizon
     if memory is None or len(memory) < PICTURES // 4:
         return
     ranks = np.arange(max(0, len(memory) - PICTURES), len(memory))
     images, rows = memory.images(ranks), memory.rows[ranks]
     bright, contrast = np.median(images.mean((1, 2))), np.median(images.std((1, 2)))
     yield bool(bright < 15), "camera too dark", f"brightness {bright:.0f} of 255"
-    blank = bright >= 15 and contrast < 5
-    yield bool(blank), "camera shows nothing", f"contrast {contrast:.0f} of 255"
+    blank = bool(bright >= 15 and contrast < 5)
+    yield blank, "camera shows nothing", f"contrast {contrast:.0f} of 255"
     moved = np.hypot(np.diff(rows["x_m"]), np.diff(rows["y_m"])) > 1e-3
     pairs = moved & (np.diff(rows["id"].astype(np.int64)) == 1)
     same = float((images[1:] == images[:-1]).all((1, 2))[pairs].sum() / max(pairs.sum(), 50))
     yield same > 0.3, "camera frozen", f"{same:.0%} of the pictures equal the one before"
-
-
-def _training(seen: Evidence) -> Told:
-    """Whether the network is trained as often as the settings say, and to what effect."""
-    learning, steps = seen.config.learning, seen.newest("train_steps", 10 * RECENT)
-    every = 1.0 if learning.mini_batches_per_episode else float(learning.fit_every or np.inf)
-    if learning.fit_every_actions and every > 1.0 and len(steps):
-        every = max(1.0, learning.fit_every_actions / float(np.mean(seen.newest("actions"))))
-    patience = 3 * every + 10 + 20 * (learning.mode == "asynchronous")
-    grew = np.flatnonzero(np.diff(np.fmax.accumulate(np.nan_to_num(steps))) > 0)
-    idle = len(steps) - 2 - (int(grew[-1]) if len(grew) else -1)
-    alone = len({row["stage"] for row in seen.episodes}) < 2  # other stages have other settings
-    yield alone and idle >= patience, "learner stopped", f"no training for {idle} episodes"
-    allowed = 0 if learning.mode == "synchronous" else learning.max_lag_episodes
-    behind = seen.newest("weights_version", 11)[:-1] - seen.newest("acting_version", 11)[1:]
-    old = float(np.nan_to_num(behind).min(initial=np.inf))
-    yield len(behind) == 10 and old > allowed, "weights stale", f"they are {old:.0f} versions old"
-    age = seen.last("target_age")
-    yield age > RECENT, "weights stale", f"the target network is {age:.0f} episodes old"
-
-
-def _losses(seen: Evidence) -> Told:
-    """Compare the loss with that of a network that always predicts the same."""
-    rewards = seen.memory.rows["reward"] if seen.memory is not None else np.zeros(0)
-    nothing, constant = (np.mean(rewards**2), np.var(rewards)) if len(rewards) else (1.0, np.inf)
-    losses = seen.newest("loss", 10 * RECENT)
-    losses = losses[~np.isnan(losses)]
-    loss = float(np.median(losses[-5:])) if len(losses) > 2 else 0.0
-    diverged = [line for line in seen.log if "lower learning.learning_rate" in line]
-    high = bool(diverged or loss > 1.5 * nothing)
-    text = f"loss {loss:.3g} by learning.learning_rate {seen.config.learning.learning_rate:g}"
-    yield high, "learning rate too high", (diverged or [text])[-1]
-    flat = not high and loss > 0.9 * constant > 0.0 and seen.last("train_steps") >= 300
-    yield bool(flat), "loss does not fall", f"loss {loss:.3f}, a constant reaches {constant:.3f}"
-
-
-def _driven(seen: Evidence) -> Told:
-    """What samples tell that did not fill the memory: actions, and places `horizon` actions on."""
-    if seen.memory is None or not len(rows := seen.memory.rows[seen.memory.rows["episode"] > 0]):
+    if not len(rows := memory.rows[memory.rows["episode"] > 0][-DRIVEN:]):  # it is being filled
         return
-    rows, horizon = rows[-DRIVEN:], seen.config.episode.horizon
-    for name, count in zip(SHORT_NAMES, np.bincount(rows["action"], minlength=3), strict=True):
+    counts = np.bincount(rows["action"], minlength=len(SHORT_NAMES))
+    for name, count in zip(SHORT_NAMES, counts, strict=True):
         never = len(rows) >= 300 and count < 0.005 * len(rows)
         yield never, "action never taken", f"{name}: {count} of the newest {len(rows)} actions"
     ids = rows["id"] + np.uint64(horizon)
@@ -157,19 +119,44 @@ def _driven(seen: Evidence) -> Told:
     yield near > 0.5, "robot circles", f"{near:.0%} of {horizon} actions lead back to their start"
 
 
-def _memory(seen: Evidence) -> Told:
+def _training(seen: Evidence) -> Told:
+    """Whether training goes on as the settings say, and does better than a constant prediction."""
+    learning, steps = seen.config.learning, seen.newest("train_steps", 10 * RECENT)
+    every = 1.0 if learning.mini_batches_per_episode else float(learning.fit_every or np.inf)
+    if learning.fit_every_actions and every > 1.0 and len(steps):
+        every = max(1.0, learning.fit_every_actions / float(np.mean(seen.newest("actions"))))
+    patience = 3 * every + 10 + 20 * (learning.mode == "asynchronous")
+    grew = np.flatnonzero(np.diff(np.fmax.accumulate(np.nan_to_num(steps))) > 0)
+    idle = len(steps) - 2 - (int(grew[-1]) if len(grew) else -1)
+    alone = len({row["stage"] for row in seen.episodes}) < 2  # other stages have other settings
+    yield alone and idle >= patience, "learner stopped", f"no training for {idle} episodes"
+    allowed = 0 if learning.mode == "synchronous" else learning.max_lag_episodes
+    behind = seen.newest("weights_version", 11)[:-1] - seen.newest("acting_version", 11)[1:]
+    old, age = float(np.nan_to_num(behind).min(initial=np.inf)), seen.last("target_age")
+    yield len(behind) == 10 and old > allowed, "weights stale", f"they are {old:.0f} versions old"
+    yield age > RECENT, "weights stale", f"the target network is {age:.0f} episodes old"
+    rewards = seen.memory.rows["reward"] if seen.memory is not None else np.zeros(0)
+    nothing, constant = (np.mean(rewards**2), np.var(rewards)) if len(rewards) else (1.0, np.inf)
+    losses = seen.newest("loss", 10 * RECENT)
+    losses = losses[~np.isnan(losses)]
+    loss = float(np.median(losses[-5:])) if len(losses) > 2 else 0.0
+    diverged = [line for line in seen.log if "lower learning.learning_rate" in line]
+    high, text = bool(diverged or loss > 1.5 * nothing), f"loss {loss:.3g}"
+    yield high, "learning rate too high", (diverged or [text])[-1]
+    flat = bool(not high and loss > 0.9 * constant > 0.0 and seen.last("train_steps") >= 300)
+    yield flat, "loss does not fall", f"{text}, a constant reaches {constant:.3g}"
+
+
+def _kept(seen: Evidence) -> Told:
     """What is kept, what goes, and what becomes of rewards."""
     memory, capacity = seen.config.memory, seen.last("capacity")
-    driven, gone, by_age, times = (
-        float(np.nansum(seen.newest(name)))
-        for name in ("actions", "discarded", "last_resort", "equalised")
-    )
+    names = ("actions", "discarded", "last_resort", "equalised")
+    driven, gone, by_age, times = (float(np.nansum(seen.newest(name))) for name in names)
     lost = 1 - float(seen.newest("samples").sum()) / max(driven, 500)
     yield lost > 0.2 and driven > 500, "samples lost", f"{lost:.0%} of {driven:.0f} actions"
-    threshold = seen.last("threshold_percent")
+    threshold, share = seen.last("threshold_percent"), by_age / max(gone, 100)
     capped = threshold >= memory.threshold_max_percent > memory.threshold_percent
     yield capped, "threshold at its cap", f"{threshold:.0f} percent"
-    share = by_age / max(gone, 100)
     yield share > 0.2, "candidates run out", f"{share:.0%} of what was discarded went by age"
     every, between = len(seen.newest("episode")) / max(times, 1), driven / max(times, 1)
     often = times >= 3 and every < 10 and between < 0.08 * capacity
@@ -180,9 +167,8 @@ def _memory(seen: Evidence) -> Told:
     held = samples_by_world(seen.episodes[-1]["by_world"] if seen.episodes else "")
     for world in dict.fromkeys(row["world"] for row in seen.episodes):
         came = sum(int(row["samples"] or 0) for row in seen.episodes if row["world"] == world)
-        left = held.get(world, 0)
-        forgot = came > 0.1 * capacity and left < 0.02 * sum(held.values())
-        yield forgot, "memory of one world only", f"{left} samples of {world}, of {came}"
+        forgot = came > 0.1 * capacity and held.get(world, 0) < 0.02 * sum(held.values())
+        yield forgot, "memory of one world only", f"{held.get(world, 0)} samples of {world}"
 
 
 def _driving(seen: Evidence) -> Told:
@@ -197,6 +183,3 @@ def _driving(seen: Evidence) -> Told:
     rate = float(np.median(actions[1:] / np.maximum(np.diff(seconds), 1e-3)))
     busy = np.nansum(seen.newest("turn_seconds")) / max(seconds[-1] - seconds[0], 1.0)
     yield rate < 1.0, "too slow", f"{rate:.2f} actions per second, {busy:.0%} of the time trains"
-
-
-CHECKS = (_live, _camera, _training, _losses, _driven, _memory, _driving)

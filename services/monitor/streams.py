@@ -25,11 +25,9 @@ from shared.threads import stop_on_signals
 
 PUBLISHED = {stream.name: stream for stream in STREAMS if stream.delivery == "latest"}
 ASKED = [stream.name for stream in STREAMS if stream.delivery == "request"]
-NOT_SHOWN = f"cannot be watched: {', '.join(ASKED)}"
 COLUMNS = ("stream", "sender", "rate", "size", "age", "newest")
-PERIOD_S = 1.0
-KEPT = 256
-"""Newest messages of a sender that are kept: rates are of these, and `echo` prints them."""
+PERIOD_S, KEPT = 1.0, 256
+"""Of each sender so many newest messages are kept: rates are of these, `echo` prints them."""
 
 
 class Gauge:
@@ -108,7 +106,12 @@ def watch(config: Config, action: str, name: str, seconds: float) -> None:
                 for line in gauge.news():
                     console.print(line, soft_wrap=True)
             else:
-                table = Table(*COLUMNS, box=None, pad_edge=False, caption=NOT_SHOWN)
+                table = Table(
+                    *COLUMNS,
+                    box=None,
+                    pad_edge=False,
+                    caption=f"not to be watched: {' '.join(ASKED)}",
+                )
                 for row in gauge.rows():
                     table.add_row(*row)
                 console.clear()  # of a terminal only
