@@ -71,8 +71,7 @@ def run_experiment(
     """Run plans with some seeds, predecessors included; whether all came to their end.
 
     Args:
-        names: Names of plans.
-        scale: Name of a scale.
+        names, scale: Of plans, and of one scale for all.
         seeds: The seeds, or how many of each plan's own seeds, from the first on.
         out: Folder for all runs.
         jobs: Runs side by side; they divide the cores among them.
@@ -83,9 +82,8 @@ def run_experiment(
         CorridorError: A run failed; the others were stopped after their current turn.
     """
     pieces = _pieces(names, scale, seeds, out)
-    context = multiprocessing.get_context("spawn")
-    reports: Any = context.Queue()
-    stop: Any = context.Event()
+    context: Any = multiprocessing.get_context("spawn")
+    reports, stop = context.Queue(), context.Event()
     shares = _queue_of(context, shares_of(sorted(os.sched_getaffinity(0)), jobs))
     for number in STOPS:  # also where the shell had SIGINT ignored, as it does in the background
         signal.signal(number, signal.default_int_handler)

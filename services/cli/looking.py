@@ -81,10 +81,7 @@ def runs(
     if action == "prune":
         agreed = (lambda _: True) if yes else typer.confirm
         raise typer.Exit(0 if there.prune(found, whole, agreed, typer.echo) else 1)
-    from rich.console import Console
-
-    shown = there.listing(found) if action == "list" else there.side_by_side(found)
-    Console(markup=False, emoji=False, highlight=False).print(shown)
+    there.show(there.listing(found) if action == "list" else there.side_by_side(found))
 
 
 def streams(

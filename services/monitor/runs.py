@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 import shutil
+import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
+from rich.console import Console
 from rich.table import Table
 
 from services.monitor.running import locked
@@ -84,6 +86,12 @@ def side_by_side(runs: Sequence[Path]) -> Table:
         for key in differ if trees is settings else trees[0]:
             table.add_row(key, *(str(tree.get(key, "")) for tree in trees))
     return table
+
+
+def show(table: Table) -> None:
+    """Print a table, cut off nowhere but in a terminal."""
+    width = None if sys.stdout.isatty() else 1000
+    Console(markup=False, emoji=False, highlight=False, width=width).print(table)
 
 
 def prune(

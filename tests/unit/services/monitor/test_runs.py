@@ -37,9 +37,8 @@ def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
 
 
 def test_runs_are_listed_with_their_figures(
-    folders: list[Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    folders: list[Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "300")
     (folders[1] / "run.json").write_text("{}")
     with locked(folders[0]):
         assert cli.main(["runs"]) == 0
@@ -51,9 +50,8 @@ def test_runs_are_listed_with_their_figures(
 
 
 def test_one_is_shown_against_the_defaults_and_two_against_each_other(
-    folders: list[Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    folders: list[Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "300")
     assert cli.main(["runs", "show", str(folders[0])]) == 0
     shown = capsys.readouterr().out
     for part in ("memory.capacity", "4000", "commit", "total_actions", "fitness"):
