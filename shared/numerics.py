@@ -10,6 +10,7 @@ import importlib.util
 import json
 import logging
 import os
+import re
 import select
 import signal
 import subprocess
@@ -125,20 +126,18 @@ def _settled_elsewhere(
                 if now_s >= next_s:
                     next_s = now_s + NEWS_S
                     role = next((r for r in roles if not _path(folder, r).exists()), roles[-1])
-                    what = f"{role}, {tried}" if tried else "loading libraries"
-                    spent = f"{now_s - start_s:.0f} s"
-                    tell(f"measuring once what computes fastest here: {what}, {spent}")
+                    what = f"{tried or 'loading libraries'}, {now_s - start_s:.0f} s"
+                    tell(f"measuring once what computes fastest here: {role}, {what}")
                 if select.select([child.stdout], [], [], POLL_S)[0]:
                     data = os.read(child.stdout.fileno(), 65536)
                     said, heard_s, ended = said + data.decode(errors="replace"), now_s, not data
-                    names = [line for line in said.splitlines() if line.startswith(TRYING)]
-                    tried = names[-1].removeprefix(TRYING) if names else ""
+                    tried = (re.findall(f"^{TRYING}(.*)", said, re.M) or [""])[-1]
                 now_s = time.monotonic()
         finally:
             if not ended:
                 child.kill()
-    others = [line for line in said.splitlines() if not line.startswith(TRYING)]
-    how = (others or ["no reason told"])[-1] if ended else f"it took longer than {TRY_S:.0f} s"
+    others = re.findall(f"^(?!{TRYING}).+", said, re.M) or ["no reason told"]
+    how = others[-1] if ended else f"it took longer than {TRY_S:.0f} s"
     if ended and child.returncode < 0:
         how = signal.Signals(-child.returncode).name
     return tried, how if child.returncode else ""

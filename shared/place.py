@@ -34,10 +34,9 @@ def is_up(folder: Path) -> bool:
 
 
 def in_use(folder: Path) -> bool:
-    """Whether a `corridor up`, a single service or an experiment works in this run folder now.
+    """Whether a `corridor up`, a service alone or an experiment works in this run folder now.
 
-    Locks of services are looked up: trying one would refuse a service that starts just then.
-    Experiments have none, but write once a minute.
+    Trying the lock of a service would refuse one that starts. An experiment writes every minute.
     """
     held, files = Path("/proc/locks").read_text(), [*(folder / "roles").glob("*.lock")]
     young = not files and time.time() - folder.stat().st_mtime < WRITTEN_S

@@ -115,7 +115,9 @@ def _samples(seen: Evidence) -> Told:
     pairs = (then["id"] == ids) & (then["commit"] == rows["commit"])
     pairs &= then["step"] == rows["step"] + horizon
     way_m = np.hypot(then["x_m"] - rows["x_m"], then["y_m"] - rows["y_m"])[pairs]
-    near = float(np.sum(way_m < 0.2 * seen.config.max_distance_m) / max(len(way_m), 200))
+    most_m, robot = seen.config.max_distance_m, seen.config.robot
+    near_m = min(max(0.2 * most_m, 3 * robot.step_m / robot.step_rad), 0.4 * most_m)
+    near = float(np.sum(way_m < near_m) / max(len(way_m), 50))  # wider than the tightest circle
     yield near > 0.5, "robot circles", f"{near:.0%} of {horizon} actions lead back to their start"
 
 

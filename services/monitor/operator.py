@@ -93,8 +93,8 @@ def _change_world(bus: Bus, name: str, message: WorldChange, present: Sequence[s
     try:
         answer = _ask(bus, ROBOT_WORLD, message, WorldChanged, name)
     except (BusError, BadMessage) as error:
-        hint = meant(name, present)
-        typer.echo(f"{name}: no answer to {message.kind}: {error}{hint}", err=True)
+        text = f"{name}: no answer to {message.kind}: {error}{meant(name, present)}"
+        typer.echo(text, err=True)
         return False
     if not answer.accepted:
         typer.echo(f"{name}: refused: {answer.reason}", err=True)

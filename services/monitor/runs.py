@@ -43,15 +43,17 @@ def read(folder: Path) -> tuple[RunInfo, list[dict[str, str]]]:
 
 
 def figures(folder: Path) -> dict[str, object]:
-    """The main figures of a run. Raises StateError."""
-    info, rows = read(folder)
+    """The main figures of a run; a damaged one says so."""
+    try:
+        info, rows = read(folder)
+    except StateError as error:
+        return {"run": error}
     preset = re.search(r"--preset[ =](\S+)", info.command)
     fitness = [float(row["fitness"]) for row in rows[-100:]]
-    left, right, actions = (
-        rows[-1][name] if rows else "0" for name in ("laps_left", "laps_right", "total_actions")
-    )
+    names = ("laps_left", "laps_right", "total_actions")
+    left, right, actions = (rows[-1][name] if rows else "0" for name in names)
     return {
-        "plan": info.experiment, "scale": info.scale, "seed": info.seed,
+        "run": folder, "plan": info.experiment, "scale": info.scale, "seed": info.seed,
         "preset": preset[1] if preset else "-", "episodes": len(rows), "actions": actions,
         "fitness": f"{sum(fitness) / len(fitness):.1f}" if fitness else "-",
         "laps": f"{left} left {right} right", "size": _megabytes([folder]),
@@ -61,16 +63,11 @@ def figures(folder: Path) -> dict[str, object]:
 
 
 def listing(runs: Sequence[Path]) -> Table:
-    """All runs, one a line; one that is damaged says so."""
-    table = Table(box=None, pad_edge=False)
-    for run in runs:
-        try:
-            told = figures(run)
-        except StateError as error:
-            told = {"plan": str(error)}
-        for column in list({"run": "", **told})[len(table.columns) :]:
-            table.add_column(column)
-        table.add_row(str(run), *map(str, told.values()))
+    """All runs, one a line."""
+    told = [figures(run) for run in runs]
+    table = Table(*max(told, key=len, default={}), box=None, pad_edge=False)
+    for each in told:
+        table.add_row(*map(str, each.values()))
     return table
 
 

@@ -24,7 +24,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "network": {"filters": 8},
     "policy": {"kind": "eps-greedy"},
     "episode": {"max_samples": 100, "horizon": 30},
-    "memory": {"capacity": 800, "equalise_every": 40},
+    "memory": {"capacity": 800, "equalise_every": 40, "threshold_max_percent": 50},
     "learning": {
         "mini_batches_per_episode": 0, "fit_every": 5, "fit_epochs": 2, "fit_after_fill": True,
         "learning_rate": 0.001, "target_average": True, "augmentation": "mirror",
