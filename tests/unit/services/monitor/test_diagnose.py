@@ -136,6 +136,12 @@ def test_every_text_is_of_an_illness_that_is_looked_for() -> None:
     assert all(f"`{illness}`" in page for illness, _ in CASES)
 
 
+def test_what_is_looked_for_in_logs_is_what_services_write() -> None:
+    root = Path(diagnose.__file__).parents[1]
+    assert " is refused: {reason}" in (root / "replay" / "service.py").read_text()
+    assert "lower learning.learning_rate" in (root / "learner" / "service.py").read_text()
+
+
 def test_it_is_light() -> None:
     heavy = "torch pybullet matplotlib zenoh"
     code = "import sys, services.monitor.diagnose as _; print(sys.modules.keys() & sys.argv[1:])"
