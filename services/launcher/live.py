@@ -69,14 +69,14 @@ def warnings(view: RunView) -> list[str]:
 
 def _robot_warnings(view: RunView) -> Iterator[str]:
     for name, seen in view.snapshot.robots.items():
+        if name in view.commanded:
+            yield f"robot {name}: the actor gave way to `corridor drive` or another commander"
         if seen.message.state == "estop":
             yield f"robot {name}: emergency stop, release it by `corridor clear`"
         elif seen.message.state == "paused":
             yield f"robot {name}: paused, let it go on by `corridor resume`"
         if seen.message.reason:
             yield f"robot {name}: stands still: {seen.message.reason}"
-        if name in view.commanded:
-            yield f"robot {name}: the actor gave way to `corridor drive` or another commander"
 
 
 def _child_warnings(view: RunView) -> Iterator[str]:
