@@ -1,7 +1,5 @@
 """Commands that tell of runs: `diagnose`, `runs` and `streams`."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Annotated, Literal

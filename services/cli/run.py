@@ -84,8 +84,14 @@ def up(
             loaded.robot.world
         )
 
-    folder, given = run_dir or default_folder(loaded), endpoint is not None
-    raise typer.Exit(run_all(loaded, folder, listen=listen, given=given, insecure=insecure))
+    code = run_all(
+        loaded,
+        run_dir or default_folder(loaded),
+        listen=listen,
+        given=endpoint is not None,
+        insecure=insecure,
+    )
+    raise typer.Exit(code)
 
 
 def status(

@@ -60,6 +60,9 @@ def run_all(
         run_record.begin(folder, stored)
         # Now, while nothing else runs.
         settle_all(stored, folder, tell=lambda line: say(line, 1), stopped=stop.is_set)
+        if stop.is_set():
+            say("corridor: stopped, the same command goes on", 1)
+            return 0
         bus = config.bus.model_copy(update={"endpoint": endpoint})
         config = config.model_copy(update={"bus": bus})
         credentials = Path(bus.credentials).absolute() if bus.credentials else ""
@@ -68,9 +71,7 @@ def run_all(
         specs = child_specs(config, stored, folder, own)
         environment = {k: v for k, v in os.environ.items() if not k.startswith(settings.ENV_PREFIX)}
         supervisor = Supervisor(specs, folder / "logs", environment, [lock])
-        ending = Ending(0, "all stopped")
-        if not stop.is_set():
-            ending = supervise(config, supervisor, stop)
+        ending = supervise(config, supervisor, stop)
     text = ending.reason if ending.code else f"{ending.reason}; the run lies in {folder}"
     say(f"corridor: {text}", 2 if ending.code else 1)
     return ending.code

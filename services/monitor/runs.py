@@ -1,7 +1,5 @@
 """What lies under `runs/`: which runs there are, how far each came, and what of it may go."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import sys

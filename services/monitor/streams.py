@@ -3,8 +3,6 @@
 Only published streams can: a request goes to the one who answers it, and nobody else sees it.
 """
 
-from __future__ import annotations
-
 import json
 import threading
 import time
