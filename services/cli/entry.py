@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import sys
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C where nothing was going on that could have ended cleanly."""
-
 
 def main() -> int:
     """Run the command line."""
@@ -25,7 +22,7 @@ def main() -> int:
 
         return rest(first_halt=first.number if first else None)
     except KeyboardInterrupt:
-        return INTERRUPTED
+        return 130  # nothing was begun that could have ended cleanly
     finally:
         if first is not None:
             first.close()

@@ -122,7 +122,7 @@ def test_ctrl_c_before_anything_begins_has_an_exit_code_of_its_own(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(cli, "main", interrupted)
-    assert entry.main() == entry.INTERRUPTED
+    assert entry.main() == 130
 
 
 def test_nothing_is_left_behind_by_a_refusal(capsys: pytest.CaptureFixture[str]) -> None:
