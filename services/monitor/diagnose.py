@@ -127,15 +127,17 @@ def _training(seen: Evidence) -> Told:
     every = 1.0 if learning.mini_batches_per_episode else float(learning.fit_every or np.inf)
     if learning.fit_every_actions and every > 1.0 and len(steps):
         every = max(1.0, learning.fit_every_actions / float(np.mean(seen.newest("actions"))))
-    patience = 3 * every + 10 + 20 * (learning.mode == "asynchronous")
+    lag = learning.max_lag_episodes if learning.mode == "asynchronous" else 0
     grew = np.flatnonzero(np.diff(np.fmax.accumulate(np.nan_to_num(steps))) > 0)
     idle = len(steps) - 2 - (int(grew[-1]) if len(grew) else -1)
     alone = len({row["stage"] for row in seen.episodes}) < 2  # other stages have other settings
-    yield alone and idle >= patience, "learner stopped", f"no training for {idle} episodes"
-    allowed = 0 if learning.mode == "synchronous" else learning.max_lag_episodes
+    stopped = alone and idle >= max(3 * every + 10, lag)
+    yield stopped, "learner stopped", f"no training for {idle} episodes"
+    others = len({row["robot"] for row in seen.episodes[-11:]}) - 1  # their episodes come between
     behind = seen.newest("weights_version", 11)[:-1] - seen.newest("acting_version", 11)[1:]
     old, age = float(np.nan_to_num(behind).min(initial=np.inf)), seen.last("target_age")
-    yield len(behind) == 10 and old > allowed, "weights stale", f"they are {old:.0f} versions old"
+    stale = len(behind) == 10 and old > lag + others
+    yield stale, "weights stale", f"they are {old:.0f} versions old"
     yield age > RECENT, "weights stale", f"the target network is {age:.0f} episodes old"
     rewards = seen.memory.rows["reward"] if seen.memory is not None else np.zeros(0)
     nothing, constant = (np.mean(rewards**2), np.var(rewards)) if len(rewards) else (1.0, np.inf)

@@ -36,8 +36,8 @@ def rows(count: int = 120, **changes: Any) -> list[dict[str, str]]:
     for e in range(1, count + 1):
         fit = e % 10 == 0
         row = {
-            "episode": e, "stage": "run", "world": "plus", "bump": 1, "fitness": LENGTH,
-            "actions": LENGTH, "samples": LENGTH, "loss": 0.1 if fit else "",
+            "episode": e, "stage": "run", "robot": "r1", "world": "plus", "bump": 1,
+            "fitness": LENGTH, "actions": LENGTH, "samples": LENGTH, "loss": 0.1 if fit else "",
             "train_steps": 10 * (e // 10), "fits": e // 10, "weights_version": 1 + e // 10,
             "acting_version": 1 + (e - 1) // 10, "target_age": 0, "capacity": 600,
             "forward": 200, "left": 200, "right": 200, "by_world": "plus=600", "discarded": 40,
@@ -120,6 +120,14 @@ def test_an_illness_is_named_and_nothing_else(illness: str, changes: dict[str, A
     (found,) = findings(replace(HEALTHY, **changes))
     assert found.illness == illness
     assert all(vars(found).values())
+
+
+def test_weights_of_one_of_two_robots_are_as_old_as_the_episode_of_the_other() -> None:
+    two = {"robot": lambda e: f"r{e % 2}", "weights_version": lambda e: e}
+    late = rows(**two, acting_version=lambda e: e - 2)
+    assert findings(replace(HEALTHY, episodes=late)) == []
+    (found,) = findings(replace(HEALTHY, episodes=rows(**two, acting_version=lambda e: e - 3)))
+    assert found.illness == "weights stale"
 
 
 @pytest.mark.parametrize("count", [0, 1, 5, 40, 120])
