@@ -38,7 +38,8 @@ def in_use(folder: Path) -> bool:
 
     Trying the lock of a service would refuse one that starts. An experiment writes every minute.
     """
-    held, files = Path("/proc/locks").read_text(), [*(folder / "roles").glob("*.lock")]
+    locks, files = Path("/proc/locks"), [*(folder / "roles").glob("*.lock")]
+    held = locks.read_text() if locks.exists() else ""
     young = not files and time.time() - folder.stat().st_mtime < WRITTEN_S
     return is_up(folder) or young or any(f":{path.stat().st_ino} " in held for path in files)
 

@@ -1,6 +1,7 @@
 """What flows on the bus: rate, size, age and content of every stream that can be watched.
 
-Only published streams can: a request goes to the one who answers it, and nobody else sees it.
+Requests cannot: they go to the one who answers them. Of what is published, watchers see what the
+table of streams gives them.
 """
 
 import json
@@ -21,8 +22,8 @@ from shared.inbox import MAX_SENDERS
 from shared.keys import STREAMS, check_sender
 from shared.threads import stop_on_signals
 
-PUBLISHED = {stream.name: stream for stream in STREAMS if stream.delivery == "latest"}
-ASKED = [stream.name for stream in STREAMS if stream.delivery == "request"]
+PUBLISHED = {s.name: s for s in STREAMS if s.delivery == "latest" and "watcher" in s.receivers}
+HIDDEN = [stream.name for stream in STREAMS if stream.name not in PUBLISHED]
 COLUMNS = ("stream", "sender", "rate", "size", "age", "newest")
 PERIOD_S, KEPT = 1.0, 256
 """Of each sender so many newest messages are kept: rates are of these, `echo` prints them."""
@@ -89,8 +90,8 @@ def watch(config: Config, action: str, name: str, seconds: float) -> None:
 
     Raises ConfigError for a stream that cannot be watched, RouterMissing.
     """
-    if name in ASKED:
-        raise ConfigError(f"{name}: a request, which only who answers it can see")
+    if name in HIDDEN:
+        raise ConfigError(f"{name}: cannot be watched, only who answers or receives it sees it")
     if name not in PUBLISHED and (name or action != "top"):
         raise not_among("stream", name, PUBLISHED)
     chosen = [name] if name else list(PUBLISHED)
@@ -108,7 +109,7 @@ def watch(config: Config, action: str, name: str, seconds: float) -> None:
                     *COLUMNS,
                     box=None,
                     pad_edge=False,
-                    caption=f"not to be watched: {' '.join(ASKED)}",
+                    caption=f"not to be watched: {' '.join(HIDDEN)}",
                 )
                 for row in gauge.rows():
                     table.add_row(*row)

@@ -52,7 +52,7 @@ def test_texts_of_others_cannot_write_to_the_terminal_and_senders_are_bounded() 
     [
         (("echo", "observatoin"), "did you mean observation?"),
         (("hz",), "stream: expected one of"),
-        (("hz", "weights"), "weights: a request"),
+        (("hz", "weights"), "weights: cannot be watched"),
         (("hzz", "action"), "did you mean hz?"),
     ],
 )
