@@ -71,7 +71,8 @@ def run_experiment(
     """Run plans with some seeds, predecessors included; whether all came to their end.
 
     Args:
-        names, scale: Of plans, and of one scale for all.
+        names: Names of plans.
+        scale: Name of a scale.
         seeds: The seeds, or how many of each plan's own seeds, from the first on.
         out: Folder for all runs.
         jobs: Runs side by side; they divide the cores among them.
@@ -94,7 +95,6 @@ def run_experiment(
         signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)  # workers inherit it, and start in peace
         futures = [pool.submit(_work, piece) for piece in pieces]
         try:
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
             _watch(futures, reports, bars)
         except KeyboardInterrupt:
             console.print("stopping after the current turns; the same command goes on")
@@ -163,6 +163,7 @@ def _bars(console: Console) -> Bars:
 
 def _watch(futures: list[Future[bool]], reports: Any, bars: Bars) -> None:
     """Show what the runs report until all are done or one failed."""
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
     tasks: dict[str, Any] = {}
     while True:
         try:
