@@ -86,8 +86,6 @@ def test_without_arguments_the_help_is_shown(capsys: pytest.CaptureFixture[str])
         (("config", "--preset", "demi"), "got 'demi', did you mean demo?"),
         (("config", "--set", "robot.kind=robotin"), "did you mean robotino? (command line)"),
         (("up", "--set", "robot.world=pluss"), "did you mean plus?"),
-        (("experiment", "plus-rm"), "did you mean plus-rmm?"),
-        (("experiment", "plus-rmm", "--scale", "tent"), "did you mean tenth?"),
         (("stauts",), "Did you mean 'status'"),
         (("runs", "lst"), "did you mean list?"),
         (("config", "--config", "none.toml"), "none.toml: cannot be read"),
