@@ -81,8 +81,9 @@ def _live(seen: Evidence) -> Told:
         measured = f"silent for {heard.age_s:.0f} s" if heard else "not heard"
         yield silent and seen.live is not None, f"{name} stopped", measured
     for name, robot in live.robots.items():
-        stands = robot.message.state in ("estop", "paused", "blocked")
-        yield stands, "robot stands", f"{name}: {robot.message.state} {robot.message.reason}"
+        state, why = robot.message.state, robot.message.reason
+        stands = state in ("estop", "paused", "blocked")
+        yield stands, "robot stands", f"{name}: {state} {why}".strip()
     lost = [actor.message.refused_episodes for actor in live.actors.values()]
     count = max([len(refused), *lost, live.replay.message.refused if live.replay else 0])
     why = (refused or ["see logs/replay.log"])[-1].split(" is refused: ")[-1]
