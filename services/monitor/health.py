@@ -41,11 +41,10 @@ def check(name: str, config: Config) -> str:
         config: how to reach the run.
 
     Raises:
-        ConfigError: there is no such process.
         Sick: it does not do its job.
     """
     if name not in BY_NAME:
-        raise not_among("service", name, BY_NAME)
+        raise Sick(str(not_among("service", name, BY_NAME)))
     try:
         with Bus(config.bus, config.run.name) as bus:
             return "accepts sessions" if name == ROUTER.name else _doing(bus, name, config)
