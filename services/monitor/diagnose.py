@@ -155,13 +155,14 @@ def _training(seen: Evidence) -> Told:
 def _kept(seen: Evidence) -> Told:
     """What is kept, what goes, and what becomes of rewards."""
     memory, capacity = seen.config.memory, seen.last("capacity")
-    names = ("actions", "discarded", "last_resort", "equalised")
-    driven, gone, by_age, times = (float(np.nansum(seen.newest(name))) for name in names)
+    names = ("actions", "discarded", "last_resort", "equalised", "recomputed")
+    driven, gone, by_age, times, found = (float(np.nansum(seen.newest(name))) for name in names)
     lost = 1 - float(seen.newest("samples").sum()) / max(driven, 500)
     yield lost > 0.2 and driven > 500, "samples lost", f"{lost:.0%} of {driven:.0f} actions"
     threshold, share = seen.last("threshold_percent"), by_age / max(gone, 100)
-    capped = threshold >= memory.threshold_max_percent > memory.threshold_percent
-    yield capped, "threshold at its cap", f"{threshold:.0f} percent"
+    often = len(seen.episodes) >= LEAST and found > 0.3 * len(seen.newest("recomputed"))
+    capped = often and threshold >= memory.threshold_max_percent > memory.threshold_percent
+    yield capped, "threshold at its cap", f"{threshold:.0f} percent, and searches find too little"
     yield share > 0.2, "candidates run out", f"{share:.0%} of what was discarded went by age"
     every, between = len(seen.newest("episode")) / max(times, 1), driven / max(times, 1)
     often = times >= 3 and every < 10 and between < 0.08 * capacity

@@ -41,7 +41,8 @@ def rows(count: int = 120, **changes: Any) -> list[dict[str, str]]:
             "train_steps": 10 * (e // 10), "fits": e // 10, "weights_version": 1 + e // 10,
             "acting_version": 1 + (e - 1) // 10, "target_age": 0, "capacity": 600,
             "forward": 200, "left": 200, "right": 200, "by_world": "plus=600", "discarded": 40,
-            "equalised": int(e % 40 == 0), "last_resort": 0, "threshold_percent": 1,
+            "equalised": int(e % 40 == 0), "last_resort": 0, "threshold_percent": 7,
+            "recomputed": int(e % 10 == 0),
             "seconds": 0.5 * e, "turn_seconds": 0.1,
         }  # fmt: skip
         row |= {name: change(e) if callable(change) else change for name, change in changes.items()}
@@ -101,7 +102,7 @@ CASES: list[tuple[str, dict[str, Any]]] = [
      {"episodes": rows(world=lambda e: "minus" if e < 60 else "plus")}),
     ("memory out of balance", {"episodes": rows(forward=590, left=5, right=5)}),
     ("equalising too often", {"episodes": rows(equalised=1)}),
-    ("threshold at its cap", {"episodes": rows(threshold_percent=7)}),
+    ("threshold at its cap", {"episodes": rows(threshold_percent=7, recomputed=1)}),
     ("candidates run out", {"episodes": rows(last_resort=20)}),
     ("weights stale", {"episodes": rows(acting_version=1)}),
     ("weights stale", {"episodes": rows(target_age=150)}),
