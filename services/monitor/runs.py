@@ -75,10 +75,11 @@ def side_by_side(runs: Sequence[Path]) -> Table:
     settings = [flatten(read_folder(run).to_dict()) for run in runs]
     others = settings if len(runs) > 1 else [flatten(Config().to_dict())]
     differ = [key for key in settings[0] if any(s[key] != o[key] for s in settings for o in others)]
-    records = [read(run)[0].model_dump() for run in runs]
+    records = [{k: v for k, v in read(run)[0].model_dump().items() if v} for run in runs]
     newest = [(read(run)[1] or [{}])[-1] for run in runs]
     for trees in (settings, records, newest, list(map(figures, runs))):
-        for key in differ if trees is settings else trees[0]:
+        every = dict.fromkeys(key for tree in trees for key in tree)
+        for key in differ if trees is settings else every:
             table.add_row(key, *(str(tree.get(key, "")) for tree in trees))
     return table
 
