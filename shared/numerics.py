@@ -130,7 +130,8 @@ def _settled_elsewhere(
                     tell(f"measuring once what computes fastest here: {role}, {what}")
                 if select.select([child.stdout], [], [], POLL_S)[0]:
                     data = os.read(child.stdout.fileno(), 65536)
-                    said, heard_s, ended = said + data.decode(errors="replace"), now_s, not data
+                    said, ended = said + data.decode(errors="replace"), not data
+                    heard_s = time.monotonic()
                     tried = (re.findall(f"^{TRYING}(.*)", said, re.M) or [""])[-1]
                 now_s = time.monotonic()
         finally:
