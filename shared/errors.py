@@ -17,6 +17,8 @@ CorridorError
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
 from reprlib import repr as brief
 from typing import TYPE_CHECKING
 
@@ -90,6 +92,20 @@ class PeerRefused(BusError):
 
 class RobotTaken(BusError):
     """Somebody else commands this robot: there is one commander at a time."""
+
+
+def meant(given: str, known: Iterable[str]) -> str:
+    """The known name that a mistyped one is nearest to, as the end of a sentence, or nothing."""
+    names = list(known)
+    near = [] if given in names else difflib.get_close_matches(given, names, n=1)
+    return f", did you mean {near[0]}?" if near else ""
+
+
+def not_among(what: str, given: str, known: Iterable[str], more: str = "") -> ConfigError:
+    """The error that says which names there are; more: what else may stand there."""
+    names = list(known)
+    text = f"{what}: expected one of {', '.join(names)}{more}, got {given!r}"
+    return ConfigError(text + meant(given, names))
 
 
 def first_problem(error: ValidationError) -> str:

@@ -8,6 +8,7 @@ import importlib.util
 import json
 import logging
 import os
+import re
 import select
 import signal
 import subprocess
@@ -32,6 +33,8 @@ ROLES: tuple[Role, ...] = get_args(Role)
 COMMAND = (sys.executable, "-P", "-m", "shared.numerics")
 TRYING, TRY_S = "trying ", 180.0
 """How a child names what it tries, and how long one try may take."""
+POLL_S, NEWS_S = 0.1, 1.5
+"""How often a child is looked at, and how often a line tells what it measures."""
 WARM_UP, ROUNDS = 2, 5
 WORTHWHILE = 0.8
 """What is not plain must take less than this part of the plain way's time to be chosen."""
@@ -71,11 +74,20 @@ def known(config: Config, folder: Path, role: Role) -> Numerics | None:
         raise StateError(f"{path}: damaged: {text}") from error
 
 
-def settle_all(config: Config, folder: Path, roles: Sequence[Role] = ROLES) -> None:
+def settle_all(
+    config: Config,
+    folder: Path,
+    roles: Sequence[Role] = ROLES,
+    *,
+    tell: Callable[[str], None] = log.info,
+    stopped: Callable[[], bool] = lambda: False,
+) -> None:
     """Settle roles now, while nothing else runs that could disturb the measurement.
 
     In a process of its own: who calls this needs no torch afterwards. An accelerator that raises,
     hangs or dies there is named and left out. Raises ConfigError when nothing works.
+
+    tell: gets a line at once and every `NEWS_S`. stopped: ends it; the next call goes on.
     """
     left_out: tuple[str, ...] = ()
     while left := [
@@ -83,8 +95,8 @@ def settle_all(config: Config, folder: Path, roles: Sequence[Role] = ROLES) -> N
         for role in roles
         if not getattr(config.numerics, role).settled and not _path(folder, role).exists()
     ]:
-        tried, how = _settled_elsewhere(folder, left, left_out)
-        if not how:
+        tried, how = _settled_elsewhere(folder, left, left_out, tell, stopped)
+        if not how or stopped():
             return
         if not tried or tried in left_out:
             raise ConfigError(f"numerics of {', '.join(left)} cannot be settled here: {how}")
@@ -93,26 +105,41 @@ def settle_all(config: Config, folder: Path, roles: Sequence[Role] = ROLES) -> N
 
 
 def _settled_elsewhere(
-    folder: Path, roles: Sequence[Role], left_out: Sequence[str]
+    folder: Path,
+    roles: Sequence[Role],
+    left_out: Sequence[str],
+    tell: Callable[[str], None],
+    stopped: Callable[[], bool],
 ) -> tuple[str, str]:
     """What a child that settles roles tried last, and what it died of; empty if it did not."""
     command = (*COMMAND, str(folder), json.dumps(left_out), *roles)
-    said = b""
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as child:
+    said, tried, ended = "", "", False
+    with subprocess.Popen(  # in a session of its own: Ctrl-C is the parent's business
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True
+    ) as child:
         assert child.stdout is not None
-        while ready := select.select([child.stdout], [], [], TRY_S)[0]:
-            if not (data := os.read(child.stdout.fileno(), 65536)):
-                break
-            said += data
-        if not ready:
-            child.kill()
-    lines = said.decode(errors="replace").splitlines()
-    tried = [line.removeprefix(TRYING) for line in lines if line.startswith(TRYING)]
-    last = next((line for line in reversed(lines) if not line.startswith(TRYING)), "no reason told")
-    how = last if ready else f"it took longer than {TRY_S:.0f} s"
-    if ready and child.returncode < 0:
+        start_s = heard_s = next_s = now_s = time.monotonic()
+        try:
+            while not (ended or stopped()) and now_s - heard_s < TRY_S:
+                if now_s >= next_s:
+                    next_s = now_s + NEWS_S
+                    role = next((r for r in roles if not _path(folder, r).exists()), roles[-1])
+                    what = f"{tried or 'loading libraries'}, {now_s - start_s:.0f} s"
+                    tell(f"measuring once what computes fastest here: {role}, {what}")
+                if select.select([child.stdout], [], [], POLL_S)[0]:
+                    data = os.read(child.stdout.fileno(), 65536)
+                    said, ended = said + data.decode(errors="replace"), not data
+                    heard_s = time.monotonic()
+                    tried = (re.findall(f"^{TRYING}(.*)", said, re.M) or [""])[-1]
+                now_s = time.monotonic()
+        finally:
+            if not ended:
+                child.kill()
+    others = re.findall(f"^(?!{TRYING}).+", said, re.M) or ["no reason told"]
+    how = others[-1] if ended else f"it took longer than {TRY_S:.0f} s"
+    if ended and child.returncode < 0:
         how = signal.Signals(-child.returncode).name
-    return tried[-1] if tried else "", how if child.returncode else ""
+    return tried, how if child.returncode else ""
 
 
 def _path(folder: Path, role: Role) -> Path:

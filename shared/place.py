@@ -6,9 +6,11 @@ router of that run listens and, in its second line, which folder of credentials 
 """
 
 import fcntl
+import time
 from pathlib import Path
 
 RUNS = Path("runs")
+WRITTEN_S = 180.0
 
 
 def try_lock(descriptor: int, kind: int) -> bool:
@@ -27,6 +29,17 @@ def is_up(folder: Path) -> bool:
             return not try_lock(stream.fileno(), fcntl.LOCK_SH)
     except OSError:
         return False
+
+
+def in_use(folder: Path) -> bool:
+    """Whether a `corridor up`, a service alone or an experiment works in this run folder now.
+
+    Trying the lock of a service would refuse one that starts. An experiment writes every minute.
+    """
+    locks, files = Path("/proc/locks"), [*(folder / "roles").glob("*.lock")]
+    held = locks.read_text() if locks.exists() else ""
+    young = not files and time.time() - folder.stat().st_mtime < WRITTEN_S
+    return is_up(folder) or young or any(f":{path.stat().st_ino} " in held for path in files)
 
 
 def those_up() -> list[Path]:

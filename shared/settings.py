@@ -5,7 +5,6 @@ refused here, before anything starts, with one `ConfigError` line that names the
 expected, what came and where it came from. The folder of a run belongs to one configuration.
 """
 
-import difflib
 import json
 import re
 import shutil
@@ -19,7 +18,7 @@ from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
 from shared.config import Config, Section
-from shared.errors import ConfigError, StateError
+from shared.errors import ConfigError, StateError, meant, not_among
 from shared.place import is_up
 from shared.statefile import create, write_atomically
 
@@ -263,9 +262,8 @@ class _Merged:
         if inside:
             return f"{key}: expected a key inside this section, such as {inside[0]}"
         same_end = [name for name in self.fields if name.rsplit(".", 1)[-1] == key]
-        near = same_end or difflib.get_close_matches(key, self.fields, n=1)
-        hint = f", did you mean {near[0]}?" if near else ", see `corridor config`"
-        return f"{key}: unknown key{hint}"
+        hint = f", did you mean {same_end[0]}?" if same_end else meant(key, self.fields)
+        return f"{key}: unknown key{hint or ', see `corridor config`'}"
 
     def validate(self) -> Config:
         """The checked tree. Raises ConfigError for the first problem."""
@@ -280,7 +278,10 @@ class _Merged:
         expected = problem["msg"].removeprefix("Input should be ")
         expected = re.sub(r"^String should ", "a text to ", expected)
         source = self.sources.get(key, "default")
-        raise ConfigError(f"{key}: expected {expected}, got {problem['input']!r:.100} ({source})")
+        hint = meant(str(problem["input"]), re.findall(r"'([^']+)'", expected))
+        raise ConfigError(
+            f"{key}: expected {expected}, got {problem['input']!r:.100}{hint} ({source})"
+        )
 
     def _sources_of(self, text: str) -> str:
         """Where the keys named in a text came from, without repetition."""
@@ -297,8 +298,7 @@ def _read_preset(preset: str) -> tuple[Tree, str]:
     if preset.endswith(".toml") or "/" in preset:
         return _read_toml(Path(preset), "preset file"), f"preset file {preset}"
     if preset not in preset_names():
-        known = ", ".join(preset_names())
-        raise ConfigError(f"--preset: expected one of {known} or a .toml file, got {preset!r}")
+        raise not_among("--preset", preset, preset_names(), " or a .toml file")
     text = resources.files("shared").joinpath("presets", f"{preset}.toml").read_bytes()
     return _parse(text, f"preset {preset}"), f"preset {preset}"
 

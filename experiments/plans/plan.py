@@ -16,7 +16,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from experiments.plans.presentation import INHERITED, Presentation
 from shared.config import Config, Name, PolicyConfig, Section
-from shared.errors import ConfigError, first_problem
+from shared.errors import ConfigError, first_problem, not_among
 from shared.settings import preset_tree
 
 Tree = dict[str, Any]
@@ -168,7 +168,7 @@ def merged(tree: Tree, over: Mapping[str, Any]) -> Tree:
 def _text_of(name: str, folder: Traversable) -> str:
     known = plan_names(folder)
     if name not in known:
-        raise ConfigError(f"experiment: expected one of {', '.join(known)}, got {name!r}")
+        raise not_among("experiment", name, known)
     return folder.joinpath(f"{name}.toml").read_text("utf-8")
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from experiments.plans.plan import PLANS, Plan, Stage, Tree, check, full_plan, merged
 from shared.config import Config
-from shared.errors import ConfigError
+from shared.errors import ConfigError, not_among
 from shared.settings import preset_tree
 
 
@@ -59,7 +59,7 @@ def divisor_of(plan: Plan, scale: str) -> int:
 def scaled(plan: Plan, scale: str) -> Plan:
     """A plan at a scale. Raises ConfigError."""
     if scale not in SCALES:
-        raise ConfigError(f"--scale: expected one of {', '.join(SCALES)}, got {scale!r}")
+        raise not_among("--scale", scale, SCALES)
     divisor = divisor_of(plan, scale)
     if divisor > 1 and plan.stages:
         plan = _smaller(plan, divisor)

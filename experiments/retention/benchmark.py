@@ -11,7 +11,7 @@ from experiments.plans.scales import load_plan
 from experiments.retention.offline import Method
 from experiments.retention.refresh import Way
 from shared.config import Config, Name, Section
-from shared.errors import ConfigError, first_problem
+from shared.errors import ConfigError, first_problem, not_among
 
 Count = Annotated[int, Field(ge=1)]
 Names = Annotated[tuple[Name, ...], Field(strict=False)]
@@ -75,8 +75,7 @@ class Benchmark(Section):
         """Return the setting of this name. Raises ConfigError."""
         found = next((each for each in self.settings if each.name == name), None)
         if found is None:
-            known = ", ".join(each.name for each in self.settings)
-            raise ConfigError(f"--setting: expected one of {known}, got {name!r}")
+            raise not_among("--setting", name, [each.name for each in self.settings])
         return found
 
     def entries_of(self, setting: Setting, seed: int) -> list[Entry]:

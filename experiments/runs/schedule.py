@@ -82,9 +82,8 @@ def run_experiment(
         CorridorError: A run failed; the others were stopped after their current turn.
     """
     pieces = _pieces(names, scale, seeds, out)
-    context = multiprocessing.get_context("spawn")
-    reports: Any = context.Queue()
-    stop: Any = context.Event()
+    context: Any = multiprocessing.get_context("spawn")
+    reports, stop = context.Queue(), context.Event()
     shares = _queue_of(context, shares_of(sorted(os.sched_getaffinity(0)), jobs))
     for number in STOPS:  # also where the shell had SIGINT ignored, as it does in the background
         signal.signal(number, signal.default_int_handler)
@@ -92,6 +91,7 @@ def run_experiment(
         ProcessPoolExecutor(jobs, context, _begin, (reports, stop, shares)) as pool,
         _bars(console) as bars,
     ):
+        signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)  # workers inherit it, and start in peace
         futures = [pool.submit(_work, piece) for piece in pieces]
         try:
             _watch(futures, reports, bars)
@@ -162,6 +162,7 @@ def _bars(console: Console) -> Bars:
 
 def _watch(futures: list[Future[bool]], reports: Any, bars: Bars) -> None:
     """Show what the runs report until all are done or one failed."""
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
     tasks: dict[str, Any] = {}
     while True:
         try:

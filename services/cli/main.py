@@ -13,11 +13,11 @@ from typing import Any
 
 import typer
 
-from services.cli import driving, experiments, machines, run, services
+from services.cli import driving, experiments, looking, machines, run, services
 from services.cli.emulate import emulate
 from services.cli.secure import secure
 from services.cli.worlds import obstacle, world
-from shared.errors import ConfigError, CorridorError
+from shared.errors import ConfigError, CorridorError, meant
 
 UsageError: Any = typer.BadParameter.__mro__[2]
 """Base of all complaints about the command line, wherever this version of Typer keeps Click."""
@@ -25,12 +25,11 @@ UsageError: Any = typer.BadParameter.__mro__[2]
 app = typer.Typer(
     help="A robot teaches itself to drive through corridors from one camera.",
     epilog="Exit codes: 0 done, 1 crash or no answer, 2 wrong configuration or usage, 3 bad state, "
-    "4 role taken.",
+    "4 role taken, 130 interrupted. `corridor --version` prints the version.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
-for group in (machines, driving, services, run, experiments):
+for group in (machines, driving, services, run, looking, experiments):
     group.add_to(app)
 app.add_typer(world, name="world")
 app.add_typer(obstacle, name="obstacle")
@@ -48,7 +47,12 @@ def main(arguments: Sequence[str] | None = None, *, first_halt: int | None = Non
     except CorridorError as error:
         return _fail(str(error), error.exit_code)
     except UsageError as error:
-        return _fail(error.format_message(), ConfigError.exit_code)
+        text = error.format_message()
+        if bad := re.search(r"'([^']*)' is not one of (.*)\.", text):
+            text += meant(bad[1], re.findall(r"'([^']+)'", bad[2]))
+        return _fail(text, ConfigError.exit_code)
+    except typer.Abort:  # nobody answered a question
+        return _fail("nothing was changed", 1)
     return code if isinstance(code, int) else 0
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import select
+from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -71,6 +74,9 @@ def up(
     Ctrl-C stops everything within five seconds; the same command continues the run. The space key
     is the emergency stop of all its robots. All that a run produces lies in its folder.
     """
+    with suppress(OSError):  # before much is imported, and without waiting for a reader
+        if select.select([], [1], [], 0.0)[1]:
+            os.write(1, b"corridor: starting\n")
     options = {"run.name": run, "run.seed": seed, "run.episodes": episodes}
     bus = {"bus.endpoint": endpoint, "bus.credentials": credentials}
     loaded = sources.load({**options, **bus})

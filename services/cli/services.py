@@ -99,10 +99,5 @@ def router(
         tether()
     from services.router.service import run as route
 
-    route(
-        bus.endpoint,
-        typer.echo,
-        bus.credentials,
-        insecure=insecure,
-        shared_memory=bus.shared_memory,
-    )
+    shared = bus.shared_memory
+    route(bus.endpoint, typer.echo, bus.credentials, insecure=insecure, shared_memory=shared)

@@ -100,15 +100,9 @@ def obstacle_place(
 ) -> None:
     """Let a box stand in the world of a running simulation: solid, and seen."""
     box = {
-        "name": name,
-        "x_m": x,
-        "y_m": y,
-        "heading_deg": heading_deg,
-        "length_m": length,
-        "width_m": width,
-        "height_m": height,
-        "rgb": rgb,
-    }
+        "name": name, "x_m": x, "y_m": y, "heading_deg": heading_deg, "length_m": length,
+        "width_m": width, "height_m": height, "rgb": rgb,
+    }  # fmt: skip
     change = {"kind": "place", "box": box, "at_episode": at_episode}
     raise typer.Exit(_change_world(which, robot, change))
 

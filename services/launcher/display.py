@@ -10,7 +10,7 @@ from rich.live import Live
 
 from services.launcher.live import RunView, line, panel, warnings
 
-LINE_EVERY_S = 5.0
+LINE_EVERY_S = 1.5
 """Period of the plain lines; a change of the warnings shows at once."""
 LEAST_COLUMNS, LEAST_ROWS = 70, 20
 """In a smaller window the table would lose its end, which tells what is wrong."""

@@ -1,6 +1,6 @@
 """What a person sees while a run is up: pure functions from a view to text or a live table."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 from rich.console import Group, RenderableType
@@ -51,6 +51,8 @@ class RunView:
     """What became of the last order given by a key."""
     keys: bool = False
     """Whether keys are read."""
+    commanded: Collection[str] = ()
+    """Robots that somebody else than the run's actor commands."""
 
 
 # ---------------------------------------------------------------- words
@@ -70,6 +72,8 @@ def warnings(view: RunView) -> list[str]:
 
 def _robot_warnings(view: RunView) -> Iterator[str]:
     for name, seen in view.snapshot.robots.items():
+        if name in view.commanded:
+            yield f"robot {name}: the actor gave way to `corridor drive` or another commander"
         if seen.message.state == "estop":
             yield f"robot {name}: emergency stop, release it by `corridor clear`"
         elif seen.message.state == "paused":
@@ -95,7 +99,8 @@ def _child_warnings(view: RunView) -> Iterator[str]:
 
 def _silences(view: RunView) -> Iterator[str]:
     for name, seen in view.snapshot.everybody.items():
-        if seen.age_s > 3 * view.heartbeat_s:
+        gave_way = name.removeprefix("actor of ") in view.commanded
+        if seen.age_s > 3 * view.heartbeat_s and not gave_way:
             yield f"{name}: silent for {seen.age_s:.0f} s"
 
 

@@ -165,14 +165,9 @@ class _Child:
         with self._output.open("ab") as stream:
             self._offset = stream.tell()
             self.process = subprocess.Popen(
-                self.spec.command,
-                stdin=subprocess.PIPE,
-                stdout=stream,
-                stderr=stream,
-                env=environment,
-                pass_fds=descriptors,
-                start_new_session=True,
-            )
+                self.spec.command, stdin=subprocess.PIPE, stdout=stream, stderr=stream,
+                env=environment, pass_fds=descriptors, start_new_session=True,
+            )  # fmt: skip
         self._starts += 1
         self._started_s = time.monotonic()
         log.info("%s started as process %d", self.spec.name, self.process.pid)

@@ -60,12 +60,16 @@ def run_all(
         if given:
             raise ConfigError(f"--listen: bus.endpoint {config.bus.endpoint!r} was given, too")
         refuse_open_door(listen, config.bus.credentials, insecure)
+    own = None if given else listen or free_endpoint()
+    endpoint = reachable(own) if own else config.bus.endpoint
     stored = settings.claim(folder, config)
-    run_record.begin(folder, stored)
     with locked(folder) as lock, stop_on_signals() as stop:
-        settle_all(stored, folder)  # now, while nothing else runs
-        own = None if given else listen or free_endpoint()
-        endpoint = reachable(own) if own else config.bus.endpoint
+        run_record.begin(folder, stored)
+        # Now, while nothing else runs.
+        settle_all(stored, folder, tell=lambda line: say(line, 1), stopped=stop.is_set)
+        if stop.is_set():
+            say("corridor: stopped, the same command goes on", 1)
+            return 0
         bus = config.bus.model_copy(update={"endpoint": endpoint})
         config = config.model_copy(update={"bus": bus})
         credentials = Path(bus.credentials).absolute() if bus.credentials else ""
@@ -133,6 +137,7 @@ def _view(
         config.bus.heartbeat_s,
         told=watcher.told,
         keys=keys.active,
+        commanded=watcher.sight.commanded,
     )
 
 

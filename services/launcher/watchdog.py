@@ -107,10 +107,13 @@ class Watchdog:
 
     def _expected(self, name: str, sight: Sight) -> bool:
         """Whether a child that is well would give a sign now."""
+        robots = sight.snapshot.robots
+        if name == ACTOR.name and robots and robots.keys() <= sight.commanded:
+            return False  # it gave way
         if name == ACTOR.name and not self._heard[name].appeared:  # it needs a robot that observes
             fresh_s = 3 * self._config.bus.heartbeat_s
-            robots = sight.snapshot.robots.values()
-            return any(r.message.state in OBSERVING and r.age_s < fresh_s for r in robots)
+            seen = robots.values()
+            return any(r.message.state in OBSERVING and r.age_s < fresh_s for r in seen)
         return sight.connected or name == ROUTER.name
 
     def _reason(self, name: str) -> str:

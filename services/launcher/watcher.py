@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Self
 
 from services.monitor.heartbeats import Reader, Snapshot
+from services.processes import ACTOR
 from services.security.use import using
 from shared.bus import Bus
 from shared.config import Config
@@ -25,6 +26,8 @@ class Sight:
     snapshot: Snapshot = field(default_factory=Snapshot)
     connected: bool = False
     """Whether the router answers; without it nobody is heard."""
+    commanded: frozenset[str] = frozenset()
+    """Robots that somebody else than the run's actor commands, such as `corridor drive`."""
 
 
 class Watcher:
@@ -93,7 +96,10 @@ class Watcher:
         self._bus = None
 
     def _look(self, bus: Bus) -> None:
-        reader = Reader(bus.inbox())
+        reader, own = Reader(inbox := bus.inbox()), self._config.run.robots
+        inbox.watch(ACTOR.name)
         while not self._done.wait(LOOK_S):
             reader.update()
-            self.sight = Sight(reader.snapshot(), bus.connected)
+            seen = reader.snapshot()
+            others = {r for r in seen.robots if r not in own and inbox.lives(ACTOR.name, r)}
+            self.sight = Sight(seen, bus.connected, frozenset(others))

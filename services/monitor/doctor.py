@@ -186,14 +186,8 @@ def _import_fault(module: str) -> str:
 
 def _python_says(code: str) -> tuple[int, str]:
     try:
-        done = subprocess.run(
-            [sys.executable, "-P", "-c", code],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            timeout=PROBE_S,
-            check=False,
-        )
+        command = [sys.executable, "-P", "-c", code]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=PROBE_S, check=False)
     except subprocess.TimeoutExpired:
         return 1, f"took longer than {PROBE_S:.0f} s"
-    return done.returncode, done.stdout
+    return done.returncode, done.stdout + done.stderr

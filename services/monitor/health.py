@@ -17,7 +17,7 @@ from services.processes import ACTOR, BY_NAME, DRIVER, LEARNER, REPLAY, ROUTER
 from shared import settings
 from shared.bus import Bus
 from shared.config import Config
-from shared.errors import BadMessage, BusError, ConfigError
+from shared.errors import BadMessage, BusError, ConfigError, not_among
 from shared.keys import PING
 from shared.messages import Ping, ServiceReply
 
@@ -42,7 +42,7 @@ def check(name: str, config: Config) -> str:
         Sick: it does not do its job.
     """
     if name not in BY_NAME:
-        raise Sick(f"expected one of {', '.join(BY_NAME)}, got {name!r}")
+        raise Sick(str(not_among("service", name, BY_NAME)))
     try:
         with Bus(config.bus, config.run.name) as bus:
             return "accepts sessions" if name == ROUTER.name else _doing(bus, name, config)

@@ -7,10 +7,10 @@ from typing import Any, TypeVar
 import typer
 from pydantic import ValidationError
 
-from services.processes import DRIVER, SERVICES
+from services.processes import BY_NAME, DRIVER, SERVICES
 from shared.bus import Bus
 from shared.config import Config
-from shared.errors import BadMessage, BusError, ConfigError, PeerMissing, first_problem
+from shared.errors import BadMessage, BusError, ConfigError, PeerMissing, first_problem, meant
 from shared.facts import NAME
 from shared.halts.book import ALL
 from shared.halts.orders import RobotOrder, order
@@ -68,16 +68,17 @@ def change_world(config: Config, robot: str | None, **change: Any) -> int:
             raise PeerMissing(
                 f"no robot of run {config.run.name!r} answers at {config.bus.endpoint}"
             )
-        done = [_change_world(bus, name, message) for name in names]
+        done = [_change_world(bus, name, message, present) for name in names]
         return 0 if all(done) else 1
 
 
-def _change_world(bus: Bus, name: str, message: WorldChange) -> bool:
+def _change_world(bus: Bus, name: str, message: WorldChange, present: Sequence[str]) -> bool:
     """Tell one robot of a wish and print its answer; whether it accepted."""
     try:
         answer = _ask(bus, ROBOT_WORLD, message, WorldChanged, name)
     except (BusError, BadMessage) as error:
-        typer.echo(f"{name}: no answer to {message.kind}: {error}", err=True)
+        text = f"{name}: no answer to {message.kind}: {error}{meant(name, present)}"
+        typer.echo(text, err=True)
         return False
     if not answer.accepted:
         typer.echo(f"{name}: refused: {answer.reason}", err=True)
@@ -93,10 +94,13 @@ def stop_services(config: Config, services: Sequence[str]) -> int:
     Returns 1 if one is still there at the end, else 0. Raises PeerMissing or RouterMissing.
     """
     with Bus(config.bus, config.run.name) as bus:
-        peers = [p for p in bus.peers() if not services or p.service in services]
+        there = bus.peers()
+        peers = [p for p in there if not services or p.service in services]
         if not peers:
             wanted = " or ".join(services) or "service"
-            raise PeerMissing(f"no {wanted} of run {config.run.name!r} at {config.bus.endpoint}")
+            text = f"no {wanted} of run {config.run.name!r} at {config.bus.endpoint}"
+            known = {peer.service for peer in there} | BY_NAME.keys()
+            raise PeerMissing(text + "".join(meant(name, known) for name in services))
         for peer in sorted(peers, key=_stop_place):
             try:
                 _ask(bus, STOP, StopService(), ServiceReply, f"{peer.service}-{peer.id}")

@@ -20,10 +20,10 @@ from services.monitor.words import (
     replay_doing,
     retention,
 )
-from services.processes import ACTOR, DRIVER, LEARNER, REPLAY
+from services.processes import ACTOR, BY_NAME, DRIVER, LEARNER, REPLAY
 from shared.bus import Bus
 from shared.config import Config
-from shared.errors import BadMessage, BusError
+from shared.errors import BadMessage, BusError, meant
 from shared.keys import PING, Peer
 from shared.messages import Ping, ServiceReply
 
@@ -48,14 +48,7 @@ def show(config: Config, *, as_json: bool, require: Sequence[str]) -> int:
 
     Raises RouterMissing.
     """
-    with Bus(config.bus, config.run.name) as bus:
-        reader = Reader(inbox := bus.inbox())
-        entries = [Entry(peer, _ping(bus, peer)) for peer in bus.peers()]
-        deadline_s = time.monotonic() + HEARTBEATS * config.bus.heartbeat_s
-        while not _complete(entries, reader.snapshot()) and time.monotonic() < deadline_s:
-            inbox.wait(0.1)
-            reader.update()
-        snapshot = reader.snapshot()
+    entries, snapshot = look(config)
     if as_json:
         typer.echo(json.dumps(as_dict(config, entries, snapshot), indent=2))
     else:
@@ -64,8 +57,21 @@ def show(config: Config, *, as_json: bool, require: Sequence[str]) -> int:
     answering = {entry.peer.service for entry in entries if entry.reply is not None}
     missing = [name for name in require if name not in answering]
     if missing:
-        typer.echo(f"corridor: no answer from {', '.join(missing)}", err=True)
+        hint = meant(missing[0], answering | BY_NAME.keys())
+        typer.echo(f"corridor: no answer from {', '.join(missing)}{hint}", err=True)
     return 1 if missing else 0
+
+
+def look(config: Config) -> tuple[list[Entry], Snapshot]:
+    """Who is there, and the heartbeats of all of them. Raises RouterMissing."""
+    with Bus(config.bus, config.run.name) as bus:
+        reader = Reader(inbox := bus.inbox())
+        entries = [Entry(peer, _ping(bus, peer)) for peer in bus.peers()]
+        deadline_s = time.monotonic() + HEARTBEATS * config.bus.heartbeat_s
+        while not _complete(entries, reader.snapshot()) and time.monotonic() < deadline_s:
+            inbox.wait(0.1)
+            reader.update()
+        return entries, reader.snapshot()
 
 
 def as_dict(config: Config, entries: Sequence[Entry], snapshot: Snapshot) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from shared.errors import ConfigError
+from shared.errors import ConfigError, not_among
 from shared.facts import NAME
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class Credential:
 def check(credential: Credential) -> None:
     """Raise ConfigError for a credential that makes no sense."""
     if credential.kind not in KINDS:
-        raise ConfigError(f"role: expected one of {', '.join(KINDS)}, got {credential.kind!r}")
+        raise not_among("role", credential.kind, KINDS)
     meaning, count = KINDS[credential.kind].names, len(credential.names)
     fits = {"none": count == 0, "one robot": count == 1, "a person": count <= 1, "robots": True}
     if not fits[meaning]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from shared.bus import Bus
-from shared.errors import PeerMissing
+from shared.errors import PeerMissing, meant
 from shared.halts.book import ALL, RELEASE_WITHIN_S, new_halt
 from shared.keys import HALT, RELEASE, Role
 from shared.messages import MAX_HALTS, Deadline, HaltKind, Halts, Message, Release, Standing
@@ -97,7 +97,7 @@ def halt(
         if not roll.done and not roll.missing and time.monotonic() - start_s > NOBODY_S:
             raise PeerMissing(
                 f"no robot of run {bus.run!r} answers at {bus.config.endpoint}; services that "
-                f"are there hold it for a robot that starts"
+                f"are there hold it for a robot that starts{_meant(bus, robot)}"
             )
     for life, name in roll.missing.items():
         echo(f"{name} (life {life}): has not answered")
@@ -131,7 +131,8 @@ def release(bus: Bus, kind: HaltKind, robot: str, echo: Echo, attempts: int = 3)
         if roll.done and not roll.missing:
             return True
     if not roll.done and not roll.missing:
-        raise PeerMissing(f"no robot of run {bus.run!r} answers at {bus.config.endpoint}")
+        text = f"no robot of run {bus.run!r} answers at {bus.config.endpoint}"
+        raise PeerMissing(text + _meant(bus, robot))
     for life, name in roll.missing.items():
         echo(f"{name} (life {life}): has not answered, or stays halted")
     return False
@@ -156,6 +157,10 @@ def _round(bus: Bus, message: Message, wait_s: float, roll: Roll) -> Iterator[St
                 yield answer
         if not waited:
             return
+
+
+def _meant(bus: Bus, robot: str) -> str:
+    return meant(robot, {peer.id for peer in bus.peers(DRIVER)})
 
 
 def _name(answer: Standing) -> str:

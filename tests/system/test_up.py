@@ -65,7 +65,9 @@ def episode_numbers(folder: Path) -> list[int]:
 
 
 def test_a_run_ends_by_itself_and_is_continued_by_the_same_command(tmp_path: Path) -> None:
-    assert "4 episodes are done" in finish(start(tmp_path, "--episodes", "4"), 90)
+    output = finish(start(tmp_path, "--episodes", "4"), 90)
+    assert output.startswith("corridor: starting\n")
+    assert "4 episodes are done" in output
     first = episode_numbers(tmp_path)
     assert first[:4] == [1, 2, 3, 4]
     assert "8 episodes are done" in finish(start(tmp_path, "--episodes", "8"), 90)
@@ -76,6 +78,8 @@ def test_a_run_ends_by_itself_and_is_continued_by_the_same_command(tmp_path: Pat
     run = read_run(tmp_path)
     assert (run.info.scale, run.info.actions) == ("services", run.actions)
     assert run.train_steps > 0 < run.info.seconds
+    diagnosed = corridor("diagnose", str(tmp_path))
+    assert diagnosed.stdout.endswith("not up\nnothing found\n"), diagnosed
     reported = corridor("report", str(tmp_path), "--out", str(tmp_path / "report"))
     assert reported.returncode == 0, reported.stderr
     assert "Run of the services" in (tmp_path / "report" / "report.html").read_text()
@@ -104,7 +108,10 @@ def test_a_running_run_is_found_watched_commanded_and_stopped(tmp_path: Path) ->
         state = json.loads(corridor("status", *where, "--json").stdout)
         assert state["robots"]["robotino1"]["state"] == "estop"
         assert {service["service"] for service in state["services"]} == set(wanted)
+        assert "robot stands: robotino1: estop" in corridor("diagnose", str(tmp_path)).stdout
         assert corridor("clear", *where).returncode == 0
+        watched = corridor("streams", "echo", "observation", "--seconds", "1", *where)
+        assert watched.stdout.startswith('robotino1 {"robot": "robotino1", '), watched
         stopped = corridor("stop", *where)
         assert stopped.returncode == 0, stopped.stdout
         assert "all services have stopped" in finish(process, 20)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import pytest
-from fakes import fake_driver
+from fakes import fake_driver, message
 
 from benchmarks.waiting import wait_until
 from services.launcher.watcher import Watcher
-from shared.bus import open_router
+from shared.bus import Bus, open_router
 from shared.config import BusConfig, Config, RunConfig
+from shared.keys import ROBOT_STATE
+from shared.messages import RobotState
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
 
@@ -31,6 +33,10 @@ def test_every_robot_is_told_and_who_stands_is_shown(config: Config) -> None:
         for driver in (alpha, beta):
             assert f"{driver.name} (life {driver.life}): estop, stands" in told
         assert told.endswith("; all stand")
+        with Bus(config.bus, config.run.name) as bus:
+            bus.announce("actor", "alpha", "0" * 12, 2, "0" * 16)
+            bus.publish(ROBOT_STATE, message(RobotState, robot="alpha"), "alpha")
+            wait_until(lambda: watcher.sight.commanded == {"alpha"}, 20, "who commands alpha")
 
 
 def test_without_a_robot_or_a_router_it_says_so(

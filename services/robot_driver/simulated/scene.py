@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import math
+import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,13 +19,21 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import numpy.typing as npt
-import pybullet
 
 from services.robot_driver.robot import Pose
 from services.robot_driver.simulated.textures import box_picture, flat_tile, wall_picture
 from services.robot_driver.simulated.world import World
 from services.robot_driver.simulated.world_parts import Floats, Obstacle, Surface
 from shared.config import CameraConfig
+
+_errors = os.dup(2)
+with Path(os.devnull).open("wb") as _nowhere:
+    os.dup2(_nowhere.fileno(), 2)
+    try:
+        import pybullet  # it says on standard error when it was built
+    finally:
+        os.dup2(_errors, 2)
+        os.close(_errors)
 
 REACH_M = 0.5
 """Walls and obstacles farther away than this are not measured."""

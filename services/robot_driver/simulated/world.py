@@ -32,7 +32,7 @@ from services.robot_driver.simulated.world_parts import (
     Wall,
     inside,
 )
-from shared.errors import ConfigError, first_problem
+from shared.errors import ConfigError, first_problem, meant
 
 WORLDS = Path(__file__).parent / "worlds"
 """Folder of the worlds that come with the driver."""
@@ -263,7 +263,8 @@ def world_path(name: str) -> Path:
         return Path(name)
     files = world_files()
     if name not in files:
-        raise WorldError(f"no world named {name!r}; there are: {', '.join(files)}")
+        there = ", ".join(files)
+        raise WorldError(f"no world named {name!r}; there are: {there}{meant(name, files)}")
     return files[name]
 
 

@@ -166,7 +166,7 @@ UNSETTLED = Config(numerics=NumericsConfig(actor=ActorNumerics(engine="auto")))
     [
         ("os.kill(os.getpid(), signal.SIGILL)", "SIGILL"),
         ("raise ImportError('no AVX here')", "ImportError: no AVX here"),
-        ("time.sleep(60)", "it took longer than 0 s"),
+        ("time.sleep(60)", "it took longer than 1 s"),
     ],
 )
 def test_an_accelerator_that_fails_is_left_out_and_named_once(
@@ -179,12 +179,28 @@ def test_an_accelerator_that_fails_is_left_out_and_named_once(
     command = (sys.executable, "-S", "-c", BROKEN.format(ends=ends))
     monkeypatch.setattr(numerics, "COMMAND", command)
     if "sleep" in ends:
-        monkeypatch.setattr(numerics, "TRY_S", 0.4)
+        monkeypatch.setattr(numerics, "TRY_S", 1.0)
     numerics.settle_all(UNSETTLED, tmp_path)
     assert (tmp_path / "numerics" / "actor.json").exists()
     assert [record.getMessage() for record in caplog.records] == [
         f"numerics: openvino does not work here and is left out: {told}"
     ]
+
+
+def test_it_tells_what_it_measures_and_ends_at_once_when_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = (sys.executable, "-S", "-c", BROKEN.format(ends="time.sleep(60)"))
+    monkeypatch.setattr(numerics, "COMMAND", command)
+    monkeypatch.setattr(numerics, "NEWS_S", 0.0)
+    told: list[str] = []
+    tried = "actor, openvino"
+    numerics.settle_all(
+        UNSETTLED, tmp_path, tell=told.append, stopped=lambda: tried in told[-1] if told else False
+    )
+    assert "loading libraries" in told[0]
+    assert tried in told[-1]
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_fails_without_an_accelerator_is_told_in_one_line(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from experiments.plans.plan import Plan, read_plan, stage_config
-from experiments.plans.scales import LEAST_CAPACITY, divisor_of, scaled
+from experiments.plans.scales import LEAST_CAPACITY, divisor_of, load_plan, scaled
 from shared.errors import ConfigError
 
 TEXT = """
@@ -117,3 +117,13 @@ def test_episodes_of_unknown_length_cannot_be_counted_as_actions() -> None:
 def test_an_unknown_scale_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ConfigError, match=r"expected one of full, fifth, .*got 'mini'"):
         scaled(plan(), "mini")
+
+
+@pytest.mark.parametrize(
+    ("name", "scale", "meant"), [("plus-rm", "tenth", "plus-rmm"), ("plus-rmm", "tent", "tenth")]
+)
+def test_a_mistyped_plan_or_scale_is_answered_with_the_nearest(
+    name: str, scale: str, meant: str
+) -> None:
+    with pytest.raises(ConfigError, match=rf"did you mean {meant}\?"):
+        load_plan(name, scale)

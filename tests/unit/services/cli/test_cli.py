@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from services.cli import entry
 from services.cli import main as cli
 from services.cli.options import import_installed
 from services.launcher.up import PORTS, child_specs, free_endpoint, reachable, run_all
@@ -22,7 +23,7 @@ from shared.service import guarded
 
 COMMANDS = [
     "driver", "actor", "replay", "learner", "router", "up", "status", "stop",
-    "estop", "clear", "pause", "resume", "config", "world",
+    "estop", "clear", "pause", "resume", "config", "world", "diagnose", "runs", "streams",
 ]  # fmt: skip
 
 
@@ -82,7 +83,11 @@ def test_without_arguments_the_help_is_shown(capsys: pytest.CaptureFixture[str])
         (("actor", "extra"), "extra"),
         (("config", "--set", "memory.capacity"), "--set: expected section.key=value"),
         (("config", "--set", "memory.capcity=1"), "did you mean memory.capacity?"),
-        (("config", "--preset", "demi"), "--preset: expected one of"),
+        (("config", "--preset", "demi"), "got 'demi', did you mean demo?"),
+        (("config", "--set", "robot.kind=robotin"), "did you mean robotino? (command line)"),
+        (("up", "--set", "robot.world=pluss"), "did you mean plus?"),
+        (("stauts",), "Did you mean 'status'"),
+        (("runs", "lst"), "did you mean list?"),
         (("config", "--config", "none.toml"), "none.toml: cannot be read"),
         (("driver", "--run", "A b"), "run.name: expected a text to match pattern"),
         (("up", "--episodes", "-1"), "run.episodes: expected greater than or equal to 0, got -1"),
@@ -98,6 +103,24 @@ def test_wrong_usage_is_one_line_and_exit_code_2(
     arguments: tuple[str, ...], part: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert part in refused(capsys, 2, *arguments)
+
+
+def test_the_version_is_told_without_importing_much(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["corridor", "--version"])
+    assert entry.main() == 0
+    assert capsys.readouterr().out.startswith("corridor 0.")
+
+
+def test_ctrl_c_before_anything_begins_has_an_exit_code_of_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def interrupted(*_: object, **__: object) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "main", interrupted)
+    assert entry.main() == 130
 
 
 def test_nothing_is_left_behind_by_a_refusal(capsys: pytest.CaptureFixture[str]) -> None:

@@ -124,6 +124,8 @@ def test_a_learner_that_is_not_fitting_has_no_bar_of_its_own() -> None:
          "robot r1: emergency stop, release it by `corridor clear`"),
         ({"robots": {"r1": Seen(message(RobotState, state="paused"), 0.0)}},
          "robot r1: paused, let it go on by `corridor resume`"),
+        ({"commanded": {"r1"}, "actors": {"r1": Seen(ACTOR, 60.0)}},
+         "robot r1: the actor gave way to `corridor drive` or another commander"),
         ({"children": [ChildStatus("actor", "restarting", 1, "signal SIGKILL")]},
          "actor is being restarted after signal SIGKILL"),
         ({"children": [ChildStatus("actor", "running", 1, "exit code 1: E: x", 59.0)]},
@@ -139,6 +141,7 @@ def test_a_learner_that_is_not_fitting_has_no_bar_of_its_own() -> None:
     ],
 )  # fmt: skip
 def test_warnings(given: dict[str, Any], expected: str) -> None:
+    given = {"robots": {"r1": Seen(ROBOT, 0.0)}, **given}
     assert warnings(view(**given)) == [expected]
     assert f"! {expected}" in line(view(**given))
 

@@ -33,6 +33,7 @@ class Run:
         self._beats: dict[str, Any] = {}
         self.fields: dict[str, dict[str, Any]] = {name: {} for name in NAMES}
         """What the heartbeats of each child say, besides plain values."""
+        self.commanded: frozenset[str] = frozenset()
         self.statuses = {name: ChildStatus(name, "running", 0, "") for name in NAMES}
 
     def after(
@@ -44,7 +45,8 @@ class Run:
             self._now_s += step_s
             for name in speaking:
                 self._beats[name] = message(STATES[name], **self.fields[name])
-            sight = Sight(self._snapshot() if connected else Snapshot(), connected)
+            seen = self._snapshot() if connected else Snapshot()
+            sight = Sight(seen, connected, self.commanded)
             named.append(self._watchdog.look(self._now_s, sight, list(self.statuses.values())))
         return [name for name in named if name]
 
@@ -62,6 +64,10 @@ class Run:
             replay=seen.get("replay"),
             learner=seen.get("learner"),
         )
+
+    def give_way(self) -> None:
+        """Somebody else commands the robot from now on."""
+        self.commanded = frozenset({self._robot})
 
 
 ALL = ("replay", "learner", "actor", "driver")
@@ -159,3 +165,10 @@ def test_children_that_do_not_run_and_a_limit_of_zero() -> None:
     run.after(1, *ALL)
     run.statuses["driver"] = replace(run.statuses["driver"], state="stopped")
     assert run.after(10_000, *but("driver")) == []
+
+
+def test_an_actor_that_gave_way_is_not_missed() -> None:
+    run = Run()
+    assert run.after(10, *ALL) == []
+    run.give_way()
+    assert run.after(10 * LIMIT_S, *but("actor")) == []
