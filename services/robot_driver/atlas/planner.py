@@ -9,6 +9,7 @@ called lost might still be saved by a better plan.
 
 import math
 from dataclasses import dataclass
+from itertools import product
 
 import cv2
 import numpy as np
@@ -256,16 +257,14 @@ class PoseGrid:
         y = np.clip(grid[:, 1], 0.0, rows - 1.001)
         h = np.remainder(poses[:, 2] / self.heading_step, self.headings)
         result = np.zeros(len(poses))
-        for dh in (0, 1):
-            for dy in (0, 1):
-                for dx in (0, 1):
-                    weight = np.ones(len(poses))
-                    for value, far in ((h, dh), (y, dy), (x, dx)):
-                        rest = value - np.floor(value)
-                        weight *= rest if far else 1.0 - rest
-                    result += weight * table[
-                        (np.floor(h).astype(np.int64) + dh) % self.headings,
-                        np.floor(y).astype(np.int64) + dy,
-                        np.floor(x).astype(np.int64) + dx,
-                    ]  # fmt: skip
+        for dh, dy, dx in product((0, 1), repeat=3):
+            weight = np.ones(len(poses))
+            for value, far in ((h, dh), (y, dy), (x, dx)):
+                rest = value - np.floor(value)
+                weight *= rest if far else 1.0 - rest
+            result += weight * table[
+                (np.floor(h).astype(np.int64) + dh) % self.headings,
+                np.floor(y).astype(np.int64) + dy,
+                np.floor(x).astype(np.int64) + dx,
+            ]  # fmt: skip
         return result
