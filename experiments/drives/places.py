@@ -25,7 +25,6 @@ ROOMIEST = 0.25
 """Starts lie in at least this part of the free space, however narrow it is."""
 JITTER_RAD = math.radians(20.0)
 """Largest angle between a start's heading and the nearest wall."""
-_CHUNK = 20_000
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ def reachable(world: World, radius_m: float) -> Floats:
     columns, rows = int((x1 - x0) / GRID_M), int((y1 - y0) / GRID_M)
     y, x = (np.mgrid[0:rows, 0:columns] + 0.5) * GRID_M
     points = np.column_stack([x.ravel() + x0, y.ravel() + y0])
-    fits = (_clearance(world, points) >= radius_m).reshape(rows, columns)
+    fits = (world.clearance(points) >= radius_m).reshape(rows, columns)
     _, part_of = cv2.connectedComponents(fits.astype(np.uint8), connectivity=4)
     starts = np.array([(start.x_m - x0, start.y_m - y0) for start in world.starts])
     column, row = (starts / GRID_M).astype(np.int64).T
@@ -81,7 +80,7 @@ def start_poses(world: World, radius_m: float, count: int) -> list[Pose]:
     have the nearest wall on their right, the second, fourth ... on their left.
     """
     around = reachable(world, radius_m)
-    room_m = min(ROOM_M, float(np.quantile(_clearance(world, around), 1.0 - ROOMIEST)))
+    room_m = min(ROOM_M, float(np.quantile(world.clearance(around), 1.0 - ROOMIEST)))
     cells = _cells(world, around)
     draw = generator(SEED, "start")
     x0, y0, x1, y1 = world.bounds
@@ -106,12 +105,6 @@ def _steps(places_m: Floats, corner_m: tuple[float, float]) -> set[tuple[int, in
     """Columns and rows of the cells in which places float64 [n, 2] lie."""
     steps = np.unique(np.floor((places_m - corner_m) / CELL_M).astype(np.int64), axis=0)
     return {(int(x), int(y)) for x, y in steps}
-
-
-def _clearance(world: World, points: Floats) -> Floats:
-    """Distance to the nearest wall of many points, in parts that fit into memory."""
-    parts = [world.clearance(points[i : i + _CHUNK]) for i in range(0, len(points), _CHUNK)]
-    return np.concatenate(parts)
 
 
 def _along(world: World, point: Floats) -> float:

@@ -4,8 +4,6 @@
 seed; seeds of one experiment at one scale belong together.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -61,7 +59,7 @@ class Rows:
         """A column as text."""
         return [row[column] for row in self.rows]
 
-    def where(self, **wanted: str) -> Rows:
+    def where(self, **wanted: str) -> "Rows":
         """The rows in which columns have these values."""
         kept = (r for r in self.rows if all(r[name] == value for name, value in wanted.items()))
         return Rows(tuple(kept))
@@ -141,7 +139,7 @@ class RunFolder:
         names = sorted({name for count in counts for name in count})
         return {name: np.array([float(c.get(name, 0)) for c in counts]) for name in names}
 
-    def evaluated(self, world: str) -> Rows:
+    def evaluated(self, world: str) -> "Rows":
         """Drives of the frozen network in a world, oldest first."""
         return self.evaluations.where(driver="network", world=world)
 
@@ -262,7 +260,7 @@ def _totals(episodes: Rows) -> dict[str, float]:
     }
 
 
-def _rows(read: Callable[[], list[dict[str, str]]]) -> Rows:
+def _rows(read: Callable[[], list[dict[str, str]]]) -> "Rows":
     try:
         return Rows(tuple(read()))
     except (ValueError, OSError) as error:

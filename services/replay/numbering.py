@@ -4,8 +4,6 @@ Pure: the service keeps `Counters` on disk with the samples they number, the sin
 keeps them in a variable.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -68,7 +66,7 @@ class Counters:
         """Most actions that one robot drove without a bump, across episodes (E10, E43)."""
         return max((robot.longest_run_actions for robot in self.robots.values()), default=0)
 
-    def plus(self, **amounts: int) -> Counters:
+    def plus(self, **amounts: int) -> "Counters":
         """Return the counters with these amounts added."""
         return replace(self, **{name: getattr(self, name) + n for name, n in amounts.items()})
 
@@ -77,7 +75,7 @@ class Counters:
         return asdict(self)
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> Counters:
+    def from_dict(cls, values: dict[str, Any]) -> "Counters":
         """Return what `to_dict()` was made of. Raises StateError when it is damaged."""
         try:
             robots = {name: RobotCounters(**robot) for name, robot in values["robots"].items()}

@@ -1,7 +1,5 @@
 """The driver service: one robot on the bus, in lockstep or in real time."""
 
-from __future__ import annotations
-
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -72,7 +70,7 @@ class ServiceHost(Host):
         self._path = path
         self._loop: DriverLoop | None = None
 
-    def attach(self, loop: DriverLoop) -> None:
+    def attach(self, loop: "DriverLoop") -> None:
         """Take commands and the end of the service from this loop from now on."""
         self._loop = loop
         self._complaints = Complaints(loop.me.log.warning)

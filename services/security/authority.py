@@ -10,8 +10,6 @@ under the same name does not bring the old one back.
     FOLDER/<name>/      key.pem, cert.pem, ca.pem: what one process needs
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -106,7 +104,7 @@ class Authority:
         self._identity = Identity(key, certificate)
 
     @classmethod
-    def create(cls, folder: Path) -> Authority:
+    def create(cls, folder: Path) -> "Authority":
         """The authority of a folder; a new one if it has none."""
         home = folder / "authority"
         if not (home / "roster.json").exists():

@@ -1,7 +1,5 @@
 """Mini-batches as tensors: gathered from the store, or from a copy of it on the GPU."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +21,7 @@ class Batch(NamedTuple):
     actions: Tensor
     rewards: Tensor
 
-    def mirrored(self, which: Tensor) -> Batch:
+    def mirrored(self, which: Tensor) -> "Batch":
         """The batch with some samples, bool [k], seen in a mirror: left is right, rewards stay.
 
         The robot and its actions are symmetrical, so what it would have got in the mirrored

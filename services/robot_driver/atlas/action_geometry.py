@@ -1,7 +1,5 @@
 """Computes exactly where the three actions lead on a map, and how near to walls (A21)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -33,7 +31,7 @@ class ActionGeometry:
     radius_m: float
 
     @classmethod
-    def of(cls, config: RobotConfig) -> ActionGeometry:
+    def of(cls, config: RobotConfig) -> "ActionGeometry":
         """The actions of a configured robot."""
         period = config.period_s
         return cls(config.speed_m_s * period, config.turn_rad_s * period, config.radius_m)

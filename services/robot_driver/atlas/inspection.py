@@ -4,8 +4,6 @@
 is driven or rendered.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import dataclass

@@ -8,8 +8,8 @@ called lost might still be saved by a better plan.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 
 import cv2
 import numpy as np
@@ -43,17 +43,8 @@ class PlannedRuns:
     """[steps + 1, n, 3]; the last one stays when the run ended."""
 
 
-Gain = Callable[[Floats, Floats], Floats]
-"""Progress between poses before and after an action: two float64 [n, 3] to float64 [n]."""
-
-
-@dataclass(frozen=True)
-class _Aim:
-    """What a run makes for while it keeps some room."""
-
-    gain: Gain
-    keep_m: float
-    table: Table
+Aim = tuple[int, float]
+"""What a run makes for: a direction round the lap centre, while it keeps some room in metres."""
 
 
 class Planner:
@@ -79,7 +70,7 @@ class Planner:
         """float32 [rows, columns]: gap to a wall at every position."""
         self._way = [self._grid.least_on_way(self._room, a) for a in range(ACTION_COUNT)]
         self._margin = self._margin_table(horizon)
-        self._aims: dict[tuple[int, float], _Aim] = {}
+        self._gains: dict[Aim, Table] = {}
 
     def drive(self, poses: Floats, actions: int) -> PlannedRuns:
         """Planned runs that keep most room, from poses float64 [n, 3]."""
@@ -96,14 +87,10 @@ class Planner:
 
         Raises ValueError for a world without a lap centre.
         """
-
-        def turned(before: Floats, after: Floats) -> Floats:
-            return direction * _wrap(self._bearing(after) - self._bearing(before))
-
-        key = (direction, keep_m)
-        if key not in self._aims:
-            self._aims[key] = _Aim(turned, keep_m, self._gain_table(turned, keep_m))
-        return self._roll_out(pose[None, :], actions, self._aims[key])
+        aim = (direction, keep_m)
+        if aim not in self._gains:
+            self._gains[aim] = self._gain_table(aim)
+        return self._roll_out(pose[None, :], actions, aim)
 
     def winding(self, poses: Floats) -> Floats:
         """Net angle round the lap centre along float64 [steps, 3], radians, float64 [steps].
@@ -113,7 +100,7 @@ class Planner:
         angle = np.unwrap(self._bearing(poses))
         return np.asarray(angle - angle[0])
 
-    def _roll_out(self, poses: Floats, actions: int, aim: _Aim | None) -> PlannedRuns:
+    def _roll_out(self, poses: Floats, actions: int, aim: Aim | None) -> PlannedRuns:
         poses = poses.copy()
         survived = np.zeros(len(poses), np.int64)
         alive = np.arange(len(poses))
@@ -134,7 +121,7 @@ class Planner:
                 break
         return PlannedRuns(survived, np.array(chosen_all, np.int64), np.array(poses_all))
 
-    def _choose(self, poses: Floats, aim: _Aim | None) -> Ints:
+    def _choose(self, poses: Floats, aim: Aim | None) -> Ints:
         """The action with most room on its way and after it, or with most progress if safe."""
         scores = []
         for action in range(ACTION_COUNT):
@@ -144,8 +131,9 @@ class Planner:
                 self._grid.look_up(self._margin, after),
             )
             if aim is not None:
-                value = aim.gain(poses, after) + _DISCOUNT * self._grid.look_up(aim.table, after)
-                room = np.where(room > aim.keep_m, value, room - 100.0)
+                later = self._grid.look_up(self._gains[aim], after)
+                value = self._turned(poses, after, aim) + _DISCOUNT * later
+                room = np.where(room > aim[1], value, room - 100.0)
             scores.append(room)
         return np.asarray(np.argmax(np.stack(scores), axis=0), np.int64)
 
@@ -163,7 +151,7 @@ class Planner:
             table = new
         return table
 
-    def _gain_table(self, gain: Gain, keep_m: float) -> Table:
+    def _gain_table(self, aim: Aim) -> Table:
         """Discounted gain of the best safe run."""
         before = np.column_stack([self._grid.points, np.zeros(len(self._grid.points))])
         gains = []
@@ -172,9 +160,9 @@ class Planner:
             for h in range(self._grid.headings):
                 before[:, 2] = h * self._grid.heading_step
                 after = self.geometry.move(before, action)
-                table[h] = gain(before, after).reshape(self._grid.shape)
+                table[h] = self._turned(before, after, aim).reshape(self._grid.shape)
             room = np.minimum(self._way[action], self._grid.after(self._margin, action, -1.0))
-            gains.append(np.where(room > keep_m, table, np.float32(-np.inf)))
+            gains.append(np.where(room > aim[1], table, np.float32(-np.inf)))
         table = np.zeros_like(self._margin)
         for _ in range(_SWEEPS):
             best = [
@@ -182,6 +170,11 @@ class Planner:
             ]
             table = np.maximum(np.maximum.reduce(best), np.float32(_LOST))
         return table
+
+    def _turned(self, before: Floats, after: Floats, aim: Aim) -> Floats:
+        """Angle round the lap centre between poses float64 [n, 3], in the wanted direction."""
+        angle = self._bearing(after) - self._bearing(before)
+        return aim[0] * np.asarray(np.remainder(angle + math.pi, 2.0 * math.pi) - math.pi)
 
     def _bearing(self, poses: Floats) -> Floats:
         if self.world.lap is None:
@@ -264,20 +257,14 @@ class PoseGrid:
         y = np.clip(grid[:, 1], 0.0, rows - 1.001)
         h = np.remainder(poses[:, 2] / self.heading_step, self.headings)
         result = np.zeros(len(poses))
-        for dh in (0, 1):
-            for dy in (0, 1):
-                for dx in (0, 1):
-                    weight = np.ones(len(poses))
-                    for value, far in ((h, dh), (y, dy), (x, dx)):
-                        rest = value - np.floor(value)
-                        weight *= rest if far else 1.0 - rest
-                    result += weight * table[
-                        (np.floor(h).astype(np.int64) + dh) % self.headings,
-                        np.floor(y).astype(np.int64) + dy,
-                        np.floor(x).astype(np.int64) + dx,
-                    ]  # fmt: skip
+        for dh, dy, dx in product((0, 1), repeat=3):
+            weight = np.ones(len(poses))
+            for value, far in ((h, dh), (y, dy), (x, dx)):
+                rest = value - np.floor(value)
+                weight *= rest if far else 1.0 - rest
+            result += weight * table[
+                (np.floor(h).astype(np.int64) + dh) % self.headings,
+                np.floor(y).astype(np.int64) + dy,
+                np.floor(x).astype(np.int64) + dx,
+            ]  # fmt: skip
         return result
-
-
-def _wrap(angle_rad: Floats) -> Floats:
-    return np.asarray(np.remainder(angle_rad + math.pi, 2.0 * math.pi) - math.pi)

@@ -1,6 +1,7 @@
 """Pictures of a world for people: a map from above and what the camera sees from several places."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -17,10 +18,12 @@ from shared.rl.preprocess import preprocess
 Picture = npt.NDArray[np.uint8]
 """uint8 [h, w, 3], RGB."""
 Colour = tuple[int, int, int]
+Point = tuple[float, float]
 
 PIXELS_PER_M = 90
 _MARGIN_PX = 110
 _INK: Colour = (40, 44, 52)
+_GREY: Colour = (120, 124, 132)
 _SOLID: Colour = (206, 206, 202)
 _FREE: Colour = (247, 246, 242)
 _ROBOT: Colour = (44, 110, 190)
@@ -43,10 +46,8 @@ def render(name: str, out: Path) -> None:
     try:
         for i, pose in enumerate(poses, start=1):
             _write(out / f"view-{i}.png", scene.frame(pose, 640, 360))
-            grey = cv2.resize(
-                preprocess(scene.frame(pose)), (750, 500), interpolation=cv2.INTER_NEAREST
-            )
-            _write(out / f"image-{i}.png", np.repeat(np.asarray(grey, np.uint8)[..., None], 3, 2))
+            grey = preprocess(scene.frame(pose)).repeat(10, axis=0).repeat(10, axis=1)
+            _write(out / f"image-{i}.png", np.repeat(grey[..., None], 3, 2))
     finally:
         scene.close()
 
@@ -81,9 +82,7 @@ def draw_map(world: World, radius_m: float, poses: list[Pose]) -> Picture:
             sheet.line((ax, ay), (bx, by), rgb, 9)
     _draw_fixtures(sheet, world)
     for obstacle in world.obstacles:
-        corners = tuple((float(x), float(y)) for x, y in obstacle.corners)
-        sheet.fill(corners, obstacle.rgb)
-        sheet.outline(corners, _INK)
+        sheet.fill(obstacle.corners.tolist(), obstacle.rgb, _INK)
         sheet.label((obstacle.x_m, obstacle.y_m), obstacle.name, _off_walls(world, obstacle))
     if world.route is not None:
         _draw_route(sheet, world.route)
@@ -117,33 +116,22 @@ class _Sheet:
         column = _MARGIN_PX + (x - self._x0) * PIXELS_PER_M
         return round(column), round(_MARGIN_PX + (self._y1 - y) * PIXELS_PER_M)
 
-    def fill(self, points: tuple[tuple[float, float], ...], rgb: Colour) -> None:
-        """A filled polygon."""
+    def fill(self, points: Sequence[Point], rgb: Colour, edge: Colour | None = None) -> None:
         corners = np.array([self.at(*point) for point in points], np.int32)
         cv2.fillPoly(self.pixels, [corners], rgb, cv2.LINE_AA)
+        if edge is not None:
+            cv2.polylines(self.pixels, [corners], True, edge, 1, cv2.LINE_AA)
 
-    def outline(self, points: tuple[tuple[float, float], ...], rgb: Colour) -> None:
-        """The edge of a polygon."""
-        corners = np.array([self.at(*point) for point in points], np.int32)
-        cv2.polylines(self.pixels, [corners], True, rgb, 1, cv2.LINE_AA)
-
-    def line(
-        self, a: tuple[float, float], b: tuple[float, float], rgb: Colour, width_px: int
-    ) -> None:
-        """A straight line."""
+    def line(self, a: Point, b: Point, rgb: Colour, width_px: int) -> None:
         cv2.line(self.pixels, self.at(*a), self.at(*b), rgb, width_px, cv2.LINE_AA)
 
-    def dot(self, place: tuple[float, float], rgb: Colour, radius_px: int = 5) -> None:
-        """A disc."""
+    def dot(self, place: Point, rgb: Colour, radius_px: int = 5) -> None:
         cv2.circle(self.pixels, self.at(*place), radius_px, rgb, -1, cv2.LINE_AA)
 
-    def text(self, place: tuple[float, float], words: str, rgb: Colour = _INK) -> None:
-        """Words that begin at a place."""
+    def text(self, place: Point, words: str, rgb: Colour = _INK) -> None:
         _put(self.pixels, self.at(*place), words, rgb)
 
-    def label(
-        self, place: tuple[float, float], words: str, way: tuple[float, float], rgb: Colour = _INK
-    ) -> None:
+    def label(self, place: Point, words: str, way: Point, rgb: Colour = _INK) -> None:
         """Words beside a place, in direction `way` from it (metres; right and up), with a rim."""
         (w, h), _ = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1)
         column, row = self.at(place[0] + way[0], place[1] + way[1])
@@ -161,10 +149,9 @@ class _Sheet:
 
     def eye(self, pose: Pose, label: str) -> None:
         """A viewpoint with its number."""
-        start, end = (pose.x_m, pose.y_m), _ahead(pose, 0.35)
-        self.line(start, end, (120, 124, 132), 2)
-        self.dot(start, (120, 124, 132))
-        self.text((pose.x_m + 0.08, pose.y_m - 0.2), label, (120, 124, 132))
+        self.line((pose.x_m, pose.y_m), _ahead(pose, 0.35), _GREY, 2)
+        self.dot((pose.x_m, pose.y_m), _GREY)
+        self.text((pose.x_m + 0.08, pose.y_m - 0.2), label, _GREY)
 
     def legend(self, world: World) -> None:
         """Title and scale bar."""
@@ -172,20 +159,19 @@ class _Sheet:
         row = self.pixels.shape[0] - 50
         for metre in range(2):
             left = _MARGIN_PX + metre * PIXELS_PER_M
-            rgb = _INK if metre % 2 == 0 else (255, 255, 255)
-            cv2.rectangle(self.pixels, (left, row - 6), (left + PIXELS_PER_M, row + 6), rgb, -1)
-            cv2.rectangle(self.pixels, (left, row - 6), (left + PIXELS_PER_M, row + 6), _INK, 1)
+            corners = (left, row - 6), (left + PIXELS_PER_M, row + 6)
+            cv2.rectangle(self.pixels, *corners, _INK if metre % 2 == 0 else (255, 255, 255), -1)
+            cv2.rectangle(self.pixels, *corners, _INK, 1)
         _put(self.pixels, (_MARGIN_PX + 2 * PIXELS_PER_M + 12, row + 6), "2 m", _INK)
         note = "S: start   number: viewpoint   red: lap line and centre   green: route, its places"
         _put(self.pixels, (_MARGIN_PX + 4 * PIXELS_PER_M, row + 6), note, _INK, 0.5)
 
 
 def _draw_fixtures(sheet: _Sheet, world: World) -> None:
-    segments = {wall.name: wall.segments for wall in world.walls}
-    lengths = {wall.name: wall.lengths for wall in world.walls}
+    walls = {wall.name: wall for wall in world.walls}
     for fixture in world.fixtures:
-        ax, ay, bx, by = segments[fixture.wall][fixture.segment]
-        length = float(lengths[fixture.wall][fixture.segment])
+        ax, ay, bx, by = walls[fixture.wall].segments[fixture.segment]
+        length = float(walls[fixture.wall].lengths[fixture.segment])
         ux, uy = (bx - ax) / length, (by - ay) / length
         near, far = fixture.at_m - fixture.width_m / 2, fixture.at_m + fixture.width_m / 2
         ends = [(ax + ux * s + uy * 0.06, ay + uy * s - ux * 0.06) for s in (near, far)]
@@ -204,7 +190,7 @@ def _draw_route(sheet: _Sheet, route: Route) -> None:
         sheet.label((place.x_m, place.y_m), place.name, (0.0, 0.26), _ROUTE)
 
 
-def _off_walls(world: World, obstacle: Obstacle) -> tuple[float, float]:
+def _off_walls(world: World, obstacle: Obstacle) -> Point:
     """Way from an obstacle's middle to where its name can be read: towards more room."""
     x, y = np.ptp(obstacle.corners, axis=0) / 2 + 0.05
     ways = np.array([(0.0, y), (0.0, -y), (x, 0.0), (-x, 0.0)])
@@ -213,22 +199,15 @@ def _off_walls(world: World, obstacle: Obstacle) -> tuple[float, float]:
     return float(way[0]), float(way[1])
 
 
-def _ahead(pose: Pose, distance_m: float) -> tuple[float, float]:
-    return (
-        pose.x_m + distance_m * math.cos(pose.heading_rad),
-        pose.y_m + distance_m * math.sin(pose.heading_rad),
-    )
+def _ahead(pose: Pose, distance_m: float) -> Point:
+    c, s = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
+    return pose.x_m + distance_m * c, pose.y_m + distance_m * s
 
 
 def _put(
-    pixels: Picture,
-    at: tuple[int, int],
-    words: str,
-    rgb: Colour,
-    size: float = 0.55,
-    width_px: int = 1,
+    pixels: Picture, at: tuple[int, int], words: str, rgb: Colour, size: float = 0.55, px: int = 1
 ) -> None:
-    cv2.putText(pixels, words, at, cv2.FONT_HERSHEY_SIMPLEX, size, rgb, width_px, cv2.LINE_AA)
+    cv2.putText(pixels, words, at, cv2.FONT_HERSHEY_SIMPLEX, size, rgb, px, cv2.LINE_AA)
 
 
 def _write(path: Path, picture: Picture) -> None:

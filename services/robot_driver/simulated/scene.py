@@ -6,8 +6,6 @@ earlier questions can influence an answer (A2). For the same reason a scene neve
 something is placed or removed, another scene is built.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 import os
@@ -122,7 +120,7 @@ class Scene:
         pixels = np.asarray(picture, np.uint8).reshape(height, width, 4)
         return np.ascontiguousarray(pixels[:, :, :3])
 
-    def shared(self) -> Scene:
+    def shared(self) -> "Scene":
         """The same scene for one more user, to be closed by them; it takes no memory to speak of.
 
         Raises ValueError when it is closed.

@@ -6,8 +6,6 @@ restored in another process continues bit for bit. Between actions the world may
 obstacles placed and removed, or another world put in its place.
 """
 
-from __future__ import annotations
-
 import copy
 import json
 import math
@@ -201,7 +199,7 @@ class SimRobot(Robot):
         self._time_s = time_s
         self._laps = LapCounter(winding_rad, lap_start_rad, left, right)
 
-    def twin(self) -> SimRobot:
+    def twin(self) -> "SimRobot":
         """Another robot in the same state, that drives on by itself; neither meets the other.
 
         Both ask one scene as long as the world of neither is changed, and each is to be closed.
