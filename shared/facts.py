@@ -46,6 +46,8 @@ Chooser = Literal["network", "chance", "human"]
 CHOOSERS = get_args(Chooser)
 HUMAN = CHOOSERS.index("human")
 
+PROTOCOL_VERSION = 3
+"""Of messages and keys: who speaks another one is refused."""
 DEFAULT_RUN, DEFAULT_ENDPOINT = "demo", "tcp/127.0.0.1:7447"
 """Name of a run, and where its router is, if nobody says otherwise."""
 NAME = re.compile(r"^[a-z0-9][a-z0-9_-]{0,40}$")

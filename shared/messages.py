@@ -16,8 +16,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 
 from shared.columns import CHANGES, EPISODE
 from shared.facts import ACTION_COUNT, ACTIONS, CHOOSERS, IMAGE_BYTES, IMAGE_SHAPE, NAME, Chooser
+from shared.facts import PROTOCOL_VERSION as PROTOCOL_VERSION
 
-PROTOCOL_VERSION = 3
 MAX_EPISODE_SAMPLES = 5000
 """More samples than this in one episode are refused, whatever the configuration says."""
 

@@ -16,12 +16,10 @@ import msgpack
 import zenoh
 
 from shared import place
-from shared.facts import DEFAULT_ENDPOINT, DEFAULT_RUN, NAME
+from shared.facts import DEFAULT_ENDPOINT, DEFAULT_RUN, NAME, PROTOCOL_VERSION
 from shared.zenoh_settings import zenoh_config
 
 OPTIONS = ("--run", "--run-dir", "--endpoint", "--credentials", "--robot")
-PROTOCOL = 2
-"""A test compares it, and the message, with those of `shared.messages`."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ def send(arguments: Sequence[str]) -> FirstStop | None:
 def message(number: int, robot: str) -> bytes:
     """A `Halts` message with one emergency stop."""
     halt = {"number": number, "kind": "estop", "robot": robot}
-    data: bytes = msgpack.packb({"v": PROTOCOL, "t": "Halts", "halts": [halt]})
+    data: bytes = msgpack.packb({"v": PROTOCOL_VERSION, "t": "Halts", "halts": [halt]})
     return data
 
 

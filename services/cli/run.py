@@ -83,10 +83,8 @@ def up(
     from services.launcher.up import run_all
 
     if loaded.robot.kind == "sim":  # refused before anything starts
-        import_installed("services.robot_driver.simulated.world", "sim").load_world(
-            loaded.robot.world
-        )
-
+        simulated = import_installed("services.robot_driver.simulated.world", "sim")
+        simulated.load_world(loaded.robot.world)
     code = run_all(
         loaded,
         run_dir or default_folder(loaded),

@@ -70,10 +70,7 @@ def run_all(
         if stop.is_set():
             say("corridor: stopped, the same command goes on", 1)
             return 0
-        bus = config.bus.model_copy(update={"endpoint": endpoint})
-        config = config.model_copy(update={"bus": bus})
-        credentials = Path(bus.credentials).absolute() if bus.credentials else ""
-        write_atomically(folder / "endpoint", f"{endpoint}\n{credentials}\n".encode())
+        config = _found_at(endpoint, config, folder)
         setup_logging("up", folder, screen=False)  # the terminal belongs to the display
         specs = child_specs(config, stored, folder, own)
         where = add_page(specs, folder) if page else str
@@ -83,6 +80,14 @@ def run_all(
     text = ending.reason if ending.code else f"{ending.reason}; the run lies in {folder}"
     say(f"corridor: {text}", 2 if ending.code else 1)
     return ending.code
+
+
+def _found_at(endpoint: str, config: Config, folder: Path) -> Config:
+    """The configuration with this endpoint, which other commands find in the folder."""
+    bus = config.bus.model_copy(update={"endpoint": endpoint})
+    credentials = Path(bus.credentials).absolute() if bus.credentials else ""
+    write_atomically(folder / "endpoint", f"{endpoint}\n{credentials}\n".encode())
+    return config.model_copy(update={"bus": bus})
 
 
 def supervise(
