@@ -65,8 +65,7 @@ def run_all(
     stored = settings.claim(folder, config)
     with locked(folder) as lock, stop_on_signals() as stop:
         run_record.begin(folder, stored)
-        # Now, while nothing else runs.
-        settle_all(stored, folder, tell=lambda line: say(line, 1), stopped=stop.is_set)
+        settle_all(stored, folder, tell=lambda line: say(line, 1), stopped=stop.is_set)  # alone
         if stop.is_set():
             say("corridor: stopped, the same command goes on", 1)
             return 0
