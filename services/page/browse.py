@@ -138,13 +138,11 @@ class Browser:
             now = memory.rows[memory.ranks(then["id"])] if there else gone[gone["id"] == query.id]
         row = then[0]
         told: dict[str, Any] = {
-            "id": query.id,
             "image": b64encode(images[0].tobytes()).decode(),
             "there": there,
             "world": memory.worlds[row["world"]],
             "reward_observed": float(row["reward"]),
             "reward": float(now[0]["reward"]) if there else None,
-            "age": self._position.turn - int(row["episode"]) if row["episode"] else None,
             "pose": [round(float(row[name]), 3) for name in ("x_m", "y_m", "heading_rad")],
         }
         told |= {n: int(row[n]) for n in ("action", "episode", "robot_episode", "step", "version")}
@@ -205,10 +203,9 @@ class Browser:
     def _removed(self, txn: Txn) -> Rows:
         """Marks of what the newest discard removed, as far as its images are still there."""
         found = self._open().column(txn, "removed", MARKS)
-        there = [
-            txn.get(key_of(int(i)), db=self._open().db["images"]) is not None for i in found["id"]
-        ]
-        return found[np.array(there, np.bool_)]
+        images = self._open().db["images"]
+        there = (txn.get(key_of(int(i)), db=images) is not None for i in found["id"])
+        return found[np.fromiter(there, np.bool_)]
 
     def _shown(self, rows: Rows) -> list[dict[str, Any]]:
         """Rows with their images, ready for JSON."""

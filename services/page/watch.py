@@ -166,10 +166,11 @@ class Watch:
             "told": self.told(),
         }
         now_s, folder = time.monotonic(), self.folder
-        if folder and now_s - self._read_s >= READ_S:
-            self._read_s = now_s
+        if folder:
             boxes = {name: folder.obstacles(name, world) for name, world in worlds.items()}
-            sections |= {"obstacles": boxes, "notes": folder.notes()}
+            sections["obstacles"] = boxes
+        if folder and now_s - self._read_s >= READ_S:
+            self._read_s, sections["notes"] = now_s, folder.notes()
             if curves := folder.curves():
                 sections["curves"] = curves
         if folder and now_s - self._judged_s >= JUDGED_S:
