@@ -264,6 +264,9 @@ def test_it_says_what_is_gone_and_comes_back(killed: str, seen: Watched, run: Ru
         "page process" if killed == "page" else "No router", timeout=15_000
     )
     expect(page.locator("body")).to_have_class("lost")
+    if killed == "page":
+        page.locator("#stop").click()
+        expect(alert).to_contain_text("NOT sent")
     wait_until(lambda: run.pid(killed) != before, 30.0, f"another {killed}")
     expect(alert).to_be_hidden(timeout=60_000)
     robots_are(page, "actor")
