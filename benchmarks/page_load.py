@@ -31,6 +31,7 @@ from benchmarks.waiting import wait_until
 from services.monitor.heartbeats import Reader
 from shared.bus import Bus
 from shared.config import BusConfig
+from shared.errors import RouterMissing
 from shared.place import used
 
 LONG = True
@@ -95,10 +96,20 @@ def rss_mb(pid: int) -> float:
     return int(found[1]) / 1e3 if found else 0.0
 
 
+def connected(endpoint: str) -> Bus | None:
+    """A client of the router, once it answers."""
+    try:
+        return Bus(BusConfig(endpoint=endpoint), RUN)
+    except RouterMissing:
+        return None
+
+
 def training(endpoint: str, seconds: float) -> float:
     """Steps of the learner per second, of the time in which it fits, from the first fit on."""
     steps, spent, before = 0, 0.0, None
-    with Bus(BusConfig(endpoint=endpoint), RUN) as bus:
+    found = wait_until(lambda: connected(endpoint), PATIENCE_S, "the router answers")
+    assert found is not None
+    with found as bus:
         reader = Reader(inbox := bus.inbox())
 
         def fits() -> bool:

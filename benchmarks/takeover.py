@@ -1,4 +1,4 @@
-"""P16: how soon a key of a person who took a robot over moves it.
+"""P17: how soon a key of a person who took a robot over moves it.
 
 `corridor takeover` runs in a terminal. The person lets the robot stand, then presses a key; what
 counts is the time until velocity reaches the emulated Robotino, or until the driver of a simulated
@@ -107,13 +107,13 @@ def fit(state: RobotState) -> bool:
 
 
 def measure(mode: Mode) -> tuple[list[list[object]], list[Bar]]:
-    """Rows of times, and the bars P16a and P16b."""
+    """Rows of times, and the bars P17a and P17b."""
     rounds = 3 if mode == "check" else rounds_of(mode, 20, 100)
     rows: list[list[object]] = []
     bars = []
     for name, ident, config in (
-        ("simulated robot in real time", "P16a", simulated()),
-        ("emulated Robotino", "P16b", configuration()),
+        ("simulated robot in real time", "P17a", simulated()),
+        ("emulated Robotino", "P17b", configuration()),
     ):
         times = [1e3 * s for s in reactions(with_person(config), rounds)]
         p95 = quantiles(times, n=20, method="inclusive")[18]

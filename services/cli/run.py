@@ -115,7 +115,7 @@ def page(
         tether()
     service = import_installed("services.page.service", "page")
     place = (which.run_dir, which.endpoint is not None, which.reach)
-    raise typer.Exit(service.run(*place, host, port, insecure=insecure))
+    raise typer.Exit(service.run(*place, host, port, insecure))
 
 
 def status(

@@ -172,7 +172,7 @@ def add_page(specs: list[ChildSpec], folder: Path) -> Callable[[], str]:
     if not all(map(find_spec, PAGE_NEEDS)):
         return lambda: NO_PAGE
     command = (*COMMAND, "page", "--run-dir", str(folder), "--tethered")
-    specs.append(ChildSpec("page", command, stage=0, may_finish=False, vital=False))
+    specs.append(ChildSpec("page", command, stage=2, may_finish=False, vital=False))
     file = folder / "page"
     return lambda: file.read_text().strip() if file.exists() else "is starting"
 

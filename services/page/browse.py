@@ -9,7 +9,6 @@ import asyncio
 from base64 import b64encode
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor
-from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from threading import Timer
@@ -96,9 +95,7 @@ class Browser:
         ages, edges = np.histogram(turn - rows["episode"][rows["episode"] > 0].astype(int), AGES)
         config = settings.read_folder(self._run).memory
         return {
-            "size": len(memory),
-            "capacity": memory.capacity,
-            "turn": turn,
+            **{"size": len(memory), "capacity": memory.capacity, "turn": turn},
             "by_action": memory.by_action(),
             "candidates": np.bincount(rows["action"][marked], minlength=ACTION_COUNT).tolist(),
             "worlds": dict(zip(memory.worlds, worlds.tolist(), strict=True)),
@@ -138,25 +135,22 @@ class Browser:
             now = memory.rows[memory.ranks(then["id"])] if there else gone[gone["id"] == query.id]
         row = then[0]
         told: dict[str, Any] = {
-            "id": query.id,
-            "image": b64encode(images[0].tobytes()).decode(),
+            "image": b64encode(images[0]).decode(),
             "there": there,
             "world": memory.worlds[row["world"]],
             "reward_observed": float(row["reward"]),
             "reward": float(now[0]["reward"]) if there else None,
-            "age": self._position.turn - int(row["episode"]) if row["episode"] else None,
             "pose": [round(float(row[name]), 3) for name in ("x_m", "y_m", "heading_rad")],
         }
-        told |= {n: int(row[n]) for n in ("action", "episode", "robot_episode", "step", "version")}
+        names = ("action", "episode", "robot_episode", "step", "version")
+        told |= {name: row[name].item() for name in names}
         told |= {n: record[n] for n in ("robot", "life", "robot_life", "ended")}
         if len(now) and now[0]["described_by"]:
             told["descriptor"] = np.unpackbits(now[0]["descriptor"]).tolist()
             told |= {"candidate": bool(now[0]["candidate"]), "forced": bool(now[0]["forced"])}
             near, bits = nearest(now[0], row["action"], memory.rows, NEIGHBOURS)
-            told["neighbours"] = [
-                {**shown, "bits": int(b)}
-                for shown, b in zip(self._shown(memory.rows[near]), bits, strict=True)
-            ]
+            found = zip(self._shown(memory.rows[near]), bits.tolist(), strict=True)
+            told["neighbours"] = [{**shown, "bits": count} for shown, count in found]
         return told
 
     def prediction(self, query: Query) -> dict[str, Any]:
@@ -175,16 +169,13 @@ class Browser:
             kept = self._open().rows(txn, [int(i) for i in page["id"]])[0] if len(page) else page
         told = self._shown(kept)
         for shown, mark, row in zip(told, page, kept, strict=True):
-            why = "decree" if mark["forced"] else "alike" if mark["candidate"] else "age"
             near, bits = nearest(mark, row["action"], memory.rows, 1, newer=True)
             like = self._shown(memory.rows[near])
-            shown |= {"why": why, "like": {**like[0], "bits": int(bits[0])} if like else None}
-        reasons = {
-            "decree": int(np.count_nonzero(gone["forced"])),
-            "alike": int(np.count_nonzero(gone["candidate"] & ~gone["forced"])),
-            "age": int(np.count_nonzero(~gone["candidate"])),
-        }
-        return {"count": len(gone), "reasons": reasons, "samples": told}
+            shown |= {"why": _why(mark)}
+            shown["like"] = {**like[0], "bits": int(bits[0])} if like else None
+        reasons = [_why(mark) for mark in gone]
+        counts = {why: reasons.count(why) for why in ("alike", "decree", "age")}
+        return {"count": len(gone), "reasons": counts, "samples": told}
 
     def _open(self) -> Tables:
         if self._tables is None:
@@ -205,10 +196,9 @@ class Browser:
     def _removed(self, txn: Txn) -> Rows:
         """Marks of what the newest discard removed, as far as its images are still there."""
         found = self._open().column(txn, "removed", MARKS)
-        there = [
-            txn.get(key_of(int(i)), db=self._open().db["images"]) is not None for i in found["id"]
-        ]
-        return found[np.array(there, np.bool_)]
+        images = self._open().db["images"]
+        there = (txn.get(key_of(int(i)), db=images) is not None for i in found["id"])
+        return found[np.fromiter(there, np.bool_)]
 
     def _shown(self, rows: Rows) -> list[dict[str, Any]]:
         """Rows with their images, ready for JSON."""
@@ -216,15 +206,9 @@ class Browser:
             return []
         with self._open().env.begin() as txn:
             images = self._open().rows(txn, [int(i) for i in rows["id"]])[1]
+        names = ("id", "action", "reward", "candidate", "episode")
         return [
-            {
-                "id": int(row["id"]),
-                "action": int(row["action"]),
-                "reward": round(float(row["reward"]), 3),
-                "candidate": bool(row["candidate"]),
-                "episode": int(row["episode"]),
-                "image": b64encode(image.tobytes()).decode(),
-            }
+            {name: row[name].item() for name in names} | {"image": b64encode(image).decode()}
             for row, image in zip(rows, images, strict=True)
         ]
 
@@ -234,8 +218,8 @@ class Browser:
         if key not in self._marked:
             found, described = np.zeros(len(memory), np.bool_), memory.rows["described_by"] > 0
             own = memory.rows[described]
-            search = partial(self._elsewhere, elsewhere.marked, self._run, own["action"].copy())
-            found[described] = search(own["descriptor"].copy(), bits)
+            what = own["action"].copy(), own["descriptor"].copy(), bits
+            found[described] = self._elsewhere(elsewhere.marked, self._run, *what)
             self._marked = {key: found}
         return self._marked[key]
 
@@ -263,6 +247,10 @@ class Browser:
         if self._child is not None:
             self._child.shutdown(wait=False, cancel_futures=True)
             self._child = None
+
+
+def _why(mark: np.void) -> str:
+    return "decree" if mark["forced"] else "alike" if mark["candidate"] else "age"
 
 
 def nearest(

@@ -7,18 +7,12 @@ import os
 import threading
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from shared import settings
 from shared.facts import ACTION_COUNT
-
-if TYPE_CHECKING:
-    from services.commander.frozen import Frozen
-
-_newest: list[tuple[int, Frozen, Any]] = []
 
 
 def begin() -> None:
@@ -38,12 +32,8 @@ def predict(run: Path, images: npt.NDArray[np.uint8]) -> tuple[list[list[float]]
     """Predictions for all actions with the target network of the newest checkpoint, its episode."""
     from services.commander import frozen
 
-    path = frozen.find(run)
-    if not _newest or _newest[0][0] != path.stat().st_mtime_ns:
-        stamp, found = path.stat().st_mtime_ns, frozen.read(path)
-        shape = settings.read_folder(run).network
-        _newest[:] = [(stamp, found, found.predictor(shape))]
-    _, found, predictor = _newest[0]
+    found = frozen.read(frozen.find(run))
+    predictor = found.predictor(settings.read_folder(run).network)
     return predictor.all_values(images).tolist(), found.episode
 
 

@@ -8,8 +8,6 @@ import json
 import threading
 from collections.abc import Sequence
 from functools import cache
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +15,7 @@ import msgpack
 import numpy as np
 import numpy.typing as npt
 
+from services.monitor.diagnose import Evidence, findings
 from services.monitor.heartbeats import Snapshot
 from services.robot_driver.simulated.world import WorldError, load_world
 from services.robot_driver.simulated.world_parts import Obstacle
@@ -90,13 +89,9 @@ class Folder:
 
     def findings(self, seen: Snapshot | None) -> list[str]:
         """Why the run does not learn. seen: its heartbeats, once all had the time to come."""
-        if not find_spec("services.monitor.diagnose"):
-            return []
-        diagnose = import_module("services.monitor.diagnose")
         trained = {row["episode"]: row for row in self._training.rows[-JUDGED:]}
         rows = [row | trained.get(row["episode"], {}) for row in self._episodes.rows[-JUDGED:]]
-        evidence = diagnose.Evidence(settings.read_folder(self.path), rows, live=seen)
-        found = diagnose.findings(evidence)
+        found = findings(Evidence(settings.read_folder(self.path), rows, live=seen))
         return [f"{f.illness}: {f.measured}; usual: {f.usual}. {f.remedy}" for f in found]
 
     def obstacles(self, robot: str, world: str) -> list[dict[str, Any]]:

@@ -153,4 +153,5 @@ class Server:
         config = uvicorn.Config(self.app, log_config=None, access_log=False, lifespan="off")
         config.ws, config.ws_max_size = "websockets-sansio", 2 * MOST_BYTES
         config.limit_concurrency, config.timeout_graceful_shutdown = 128, 1
+        config.ws_per_message_deflate = False  # it would cost more than all the rest
         uvicorn.Server(config).run([place])

@@ -21,28 +21,19 @@ from shared.threads import stop_on_signals
 
 
 def run(
-    folder: Path | None,
-    given: bool,
-    reach: Callable[[], Config],
-    host: str,
-    port: int,
-    *,
-    insecure: bool,
+    folder: Path | None, given: bool, reach: Callable[[], Config], host: str, port: int, open_: bool
 ) -> int:
     """Show a run until asked to stop.
 
     folder: that of the run; None: the run that commands reach. given: the endpoint was chosen on
-    purpose, whether or not a `corridor up` holds the folder.
-
-    Raises:
-        ConfigError: nobody may listen there, or several runs are up and none was chosen.
+    purpose, whether or not a `corridor up` holds the folder. open_: strangers may look. Raises
+    ConfigError: nobody may listen there, or several runs are up and none was chosen.
     """
     if folder is None and (up := RUNS / reach().run.name) in those_up():
         folder = up
     setup_logging("page", folder)
-    place, found = address.listen(
-        folder / "page" if folder else None, host, port, insecure=insecure
-    )
+    kept = folder / "page" if folder else None
+    place, found = address.listen(kept, host, port, insecure=open_)
     typer.echo(found.url)
 
     def now() -> Config | None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from shared.messages import Action, Observation
+from shared.messages import Action, Message, Observation
 
 STEP_M, JUMP_M = 0.08, 0.6
 """Places of the trail lie at least so far apart; over a longer way it breaks off."""
@@ -31,6 +31,13 @@ class Track:
         self.delays_ms: deque[float] = deque(maxlen=DELAYS)
         """From an observation to its answer, as both arrived here."""
         self._waiting: dict[tuple[str, int, int], float] = {}
+
+    def take(self, message: Message, at_s: float) -> None:
+        """Take up what arrived at this time."""
+        if isinstance(message, Observation):
+            self.observe(message, at_s)
+        elif isinstance(message, Action):
+            self.act(message, at_s)
 
     def observe(self, seen: Observation, at_s: float) -> None:
         """Take up an observation that arrived at this time."""

@@ -13,6 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from typing import Any, Self
 
 from services.launcher.live import RunView, warnings
@@ -26,8 +27,8 @@ from shared.codec import decode
 from shared.config import Config
 from shared.errors import BadMessage, RouterMissing
 from shared.inbox import MAX_SENDERS, Inbox
-from shared.keys import ACTION, OBSERVATION, PING
-from shared.messages import Action, Observation, Ping, ServiceReply
+from shared.keys import ACTION, OBSERVATION, PING, Stream, check_sender
+from shared.messages import Ping, ServiceReply
 
 log = logging.getLogger(__name__)
 PERIOD_S, IDLE_PERIOD_S = 0.2, 1.0
@@ -35,8 +36,8 @@ PERIOD_S, IDLE_PERIOD_S = 0.2, 1.0
 READ_S, JUDGED_S, AWAY_S = 2.0, 10.0, 3.0
 """How often the folder is read and services are asked, how often the run is judged; how long a
 router may be away."""
-KEPT = 1024
-"""Messages of one sender between two looks."""
+KEPT = 2048
+"""Messages of and for one robot between two looks."""
 
 
 class Stamped:
@@ -44,40 +45,38 @@ class Stamped:
 
     def __init__(self, bus: Bus) -> None:
         self._lock = threading.Lock()
-        self._queues: dict[tuple[type[Observation | Action], str], deque[tuple[float, bytes]]] = {}
+        self._queues: dict[str, deque[tuple[float, Stream, bytes]]] = {}
         self.lost = 0
         """Messages for which there was no room, or that could not be read."""
-        bus.subscribe(OBSERVATION, "*", lambda who, data: self._keep(Observation, who, data))
-        bus.subscribe(ACTION, "*", lambda who, data: self._keep(Action, who, data))
+        for stream in (OBSERVATION, ACTION):
+            bus.subscribe(stream, "*", partial(self._keep, stream))
 
-    def _keep(self, kind: type[Observation | Action], sender: str | None, data: bytes) -> None:
-        now_s, slot = time.monotonic(), (kind, sender or "")
+    def _keep(self, stream: Stream, robot: str | None, data: bytes) -> None:
+        now_s = time.monotonic()
         with self._lock:
-            crowded = slot not in self._queues and len(self._queues) >= 2 * MAX_SENDERS
-            if sender is None or crowded:
+            if robot is None or (robot not in self._queues and len(self._queues) >= MAX_SENDERS):
                 self.lost += 1
                 return
-            queue = self._queues.setdefault(slot, deque(maxlen=KEPT))
+            queue = self._queues.setdefault(robot, deque(maxlen=KEPT))
             self.lost += len(queue) == KEPT
-            queue.append((now_s, data))
+            queue.append((now_s, stream, data))
 
     def into(self, tracks: dict[str, Track]) -> None:
         """Tell the tracks of the robots what has come."""
         with self._lock:
             taken, self._queues = self._queues, {}
-        for kind in (Observation, Action):
-            for robot, queue in ((who, q) for (what, who), q in taken.items() if what is kind):
-                track = tracks.setdefault(robot, Track())
-                for at_s, data in queue:
-                    try:
-                        message = decode(data, kind)
-                    except BadMessage:
-                        self.lost += 1
-                        continue
-                    if isinstance(message, Observation):
-                        track.observe(message, at_s)
-                    elif isinstance(message, Action):
-                        track.act(message, at_s)
+        for robot, queue in taken.items():
+            if robot not in tracks and len(tracks) >= MAX_SENDERS:
+                self.lost += len(queue)
+                continue
+            track = tracks.setdefault(robot, Track())
+            for at_s, stream, data in queue:
+                try:
+                    message = decode(data, stream.request)
+                    check_sender(stream, robot, message)
+                    track.take(message, at_s)
+                except BadMessage:
+                    self.lost += 1
 
 
 class Watch:
@@ -166,10 +165,11 @@ class Watch:
             "told": self.told(),
         }
         now_s, folder = time.monotonic(), self.folder
-        if folder and now_s - self._read_s >= READ_S:
-            self._read_s = now_s
+        if folder:
             boxes = {name: folder.obstacles(name, world) for name, world in worlds.items()}
-            sections |= {"obstacles": boxes, "notes": folder.notes()}
+            sections["obstacles"] = boxes
+        if folder and now_s - self._read_s >= READ_S:
+            self._read_s, sections["notes"] = now_s, folder.notes()
             if curves := folder.curves():
                 sections["curves"] = curves
         if folder and now_s - self._judged_s >= JUDGED_S:

@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -142,8 +141,3 @@ def installed() -> str:
         if done.returncode:
             return f"apt-get {words[0]}: {(done.stderr.strip().splitlines() or ['failed'])[-1]}"
     return "" if shutil.which(CHROMIUM) else "chromium was installed, but is not there"
-
-
-def now_ms() -> float:
-    """A clock for what is measured."""
-    return 1e3 * time.monotonic()

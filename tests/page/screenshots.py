@@ -36,9 +36,11 @@ def look_at_memory(page: Page) -> None:
     """Open the memory with one sample in detail."""
     page.get_by_role("button", name="Memory").click()
     expect(page.locator("#wall button")).to_have_count(48, timeout=60_000)
+    page.locator("[name=candidate]").select_option("true")
+    expect(page.locator("#wall button").first).to_contain_text("candidate")
     page.locator("#wall button").nth(5).click()
     expect(page.locator("#sample")).to_contain_text("Predicted by", timeout=60_000)
-    page.evaluate("scrollTo(0, 0)")
+    page.evaluate("scrollTo(0, document.getElementById('sample').offsetTop - 400)")
 
 
 def main(arguments: list[str]) -> None:

@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from statistics import quantiles
+from statistics import median, quantiles
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, BrowserContext, Page, expect
 
+from benchmarks.robot_reaction import configuration
+from benchmarks.robot_rig import Rig
 from benchmarks.waiting import wait_until
-from shared.bus import Bus, Request
-from shared.config import BusConfig
-from shared.keys import HALT
-from shared.place import used
 from tests.page.rig import Run, at_rest, chromium, context, running
 
 pytestmark = pytest.mark.timeout(420)
-CLICKS, STOP_BAR_MS = 50, 150.0
+CLICKS, AT_ONCE, STOP_BAR_MS = 50, 10, 150.0
 expect.set_options(timeout=20_000)
 
 
@@ -145,7 +143,7 @@ def test_worlds_boxes_and_notes(seen: Watched, run: Run) -> None:
     size = page.locator("#map").bounding_box()
     assert size is not None
     page.locator("#map").click(position={"x": size["width"] / 2, "y": size["height"] / 2})
-    expect(page.locator("#told li").first).to_contain_text("place box1, second")
+    expect(page.locator("#told li").first).to_contain_text(re.compile("place box[12], second"))
     page.locator("#edit").uncheck()
     form.locator("[name=world]").select_option("minus")
     page.get_by_role("button", name="Switch").click()
@@ -220,34 +218,39 @@ def test_without_the_token_it_shows_and_commands_nothing(run: Run, browser: Brow
     window.close()
 
 
-def test_a_stop_is_heard_soon_after_the_click(seen: Watched, run: Run) -> None:
-    """From the click until zeros leave: a driver that hears a halt stops its robot before all."""
-    page, heard, halts = seen.page, threading.Event(), list[float]()
-
-    def note(request: Request) -> None:
-        with request:
-            halts.append(time.time())
-        heard.set()
-
-    where = used(run.folder)
-    assert where is not None
-    times_ms = []
-    with Bus(BusConfig(endpoint=where[0]), "twins") as bus:
-        bus.serve(HALT, "main", note)
-        page.evaluate("addEventListener('pointerdown', () => { window.at = Date.now(); }, true)")
-        for _ in range(CLICKS):
-            heard.clear()
-            halts.clear()
+def clicks_until_zeros_ms(browser: Browser, folder: Path, count: int) -> list[float]:
+    """Milliseconds from clicks on stop until zero velocity is at an emulated Robotino."""
+    found = []
+    with Rig(configuration(), folder) as rig:
+        rig.start("router", "driver", "actor")
+        run = ("--run", rig.config.run.name, "--endpoint", rig.config.bus.endpoint)
+        address = rig._first_line("page", "page", "--run-dir", str(folder), *run)
+        window = context(browser, 1280)
+        page = window.new_page()
+        page.goto(address)
+        page.evaluate("addEventListener('pointerdown', () => { window.at_ms = Date.now(); }, true)")
+        expect(page.locator(".robot .chosen")).to_have_count(1)
+        for _ in range(count):
+            rig.wait_driving()
             page.locator("#stop").click()
-            assert heard.wait(20.0)
-            times_ms.append(1e3 * halts[0] - page.evaluate("window.at"))
-        expect(page.locator("#stands")).to_contain_text("2 of 2")
-        page.get_by_role("button", name="Clear the stop").click()
-        robots_are(page, "actor")
+            clicked_s = page.evaluate("window.at_ms") / 1e3 - (time.time() - time.monotonic())
+            found.append(1e3 * rig.first_stop_s(clicked_s))
+            expect(page.locator("#stands")).to_contain_text("1 of 1")
+            page.get_by_role("button", name="Clear the stop").click()
+        window.close()
+    return found
+
+
+def test_zeros_leave_soon_after_a_click_on_stop(browser: Browser, tmp_path: Path) -> None:
+    """Now and then from the start, before the robot gets stuck somewhere."""
+    rounds = (
+        clicks_until_zeros_ms(browser, tmp_path / str(n), AT_ONCE) for n in range(CLICKS // AT_ONCE)
+    )
+    times_ms = [each for some in rounds for each in some]
     p95 = quantiles(times_ms, n=20)[-1]
     print(
-        f"\nstop: {CLICKS} clicks, p95 {p95:.0f} ms until the halt is heard, "
-        f"{max(times_ms):.0f} ms at most"
+        f"\nstop: {CLICKS} clicks, zeros at the robot after {p95:.0f} ms (p95), "
+        f"{median(times_ms):.0f} ms (median), {max(times_ms):.0f} ms at most"
     )
     assert p95 <= STOP_BAR_MS
 
@@ -280,6 +283,9 @@ def test_it_says_what_is_gone_and_comes_back(killed: str, seen: Watched, run: Ru
         "page process" if killed == "page" else "No router", timeout=15_000
     )
     expect(page.locator("body")).to_have_class("lost")
+    if killed == "page":
+        page.locator("#stop").click()
+        expect(alert).to_contain_text("NOT sent")
     wait_until(lambda: run.pid(killed) != before, 30.0, f"another {killed}")
     expect(alert).to_be_hidden(timeout=60_000)
     robots_are(page, "actor")

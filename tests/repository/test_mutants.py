@@ -25,6 +25,7 @@ PACKAGES = (
     "services/commander",
     "services/monitor",
     "services/launcher",
+    "services/page",
     "services/recorder",
     "services/router",
     "services/security",

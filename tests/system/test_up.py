@@ -123,13 +123,16 @@ def test_killed_services_are_restarted_and_the_run_goes_on(tmp_path: Path) -> No
     process = start(tmp_path)
     try:
         wait_until((tmp_path / "episodes.csv").exists, 40, "metrics")
-        for name in ("replay", "router", "actor"):
+        address = (tmp_path / "page").read_text()
+        for name in ("replay", "router", "actor", "page"):
             os.kill(started(tmp_path, name)[-1], signal.SIGKILL)
             wait_until(partial(was_restarted, tmp_path, name), 20, f"{name} again")
         before = len(episode_numbers(tmp_path))
         wait_until(lambda: len(episode_numbers(tmp_path)) >= before + 2, 60, "two more episodes")
         process.send_signal(signal.SIGINT)
-        assert "all stopped" in finish(process, 20)
+        assert f"page {address.strip()} | " in (said := finish(process, 20))
+        assert "all stopped" in said
+        assert (tmp_path / "page").read_text() == address  # a browser finds it again
         numbers = episode_numbers(tmp_path)
         assert numbers == list(range(1, len(numbers) + 1))
     finally:

@@ -4,11 +4,12 @@ import { openMemory } from "./memory.js";
 import { paintWheel, wheel } from "./wheel.js";
 
 const SILENT_MS = 3000, token = location.hash.slice(1), known = {};
-let socket, backoff_ms = 500, heard_ms = 0, toMetres = null, chosen = "";
+let socket, backoff_ms = 500, heard_ms = 0, gone = false, toMetres = null, chosen = "";
 
 function send(message) {
-  if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ token, ...message }));
-  else alarm("NOT sent: the page process does not answer.");
+  if (socket.readyState !== WebSocket.OPEN) return alarm("NOT sent: the page process does not answer.");
+  if (!document.body.classList.contains("lost")) alarm("");
+  socket.send(JSON.stringify({ token, ...message }));
 }
 
 function alarm(words) {
@@ -21,7 +22,7 @@ function connect() {
   socket.onmessage = ({ data }) => {
     const { number, sections, refused } = JSON.parse(data);
     if (refused) return alarm(`Refused: ${refused}`);
-    [heard_ms, backoff_ms] = [Date.now(), 500];
+    [heard_ms, backoff_ms, gone] = [Date.now(), 500, false];
     Object.assign(known, sections);
     try { paint(sections); } finally { socket.send(JSON.stringify({ seen: number })); }
   };
@@ -33,6 +34,8 @@ function connect() {
 }
 
 function lost() {
+  if (gone) return; // what was told since stays
+  gone = true;
   document.body.classList.add("lost");
   alarm("The page process does not answer; trying again."
     + (heard_ms ? ` What you see is as it was at ${new Date(heard_ms).toLocaleTimeString()}.` : ""));

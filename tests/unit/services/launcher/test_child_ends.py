@@ -13,20 +13,22 @@ from services.launcher.supervisor import ChildSpec, Ending, Supervisor
 
 
 @pytest.mark.parametrize(
-    ("code", "may_finish", "ending", "state"),
+    ("code", "may_finish", "vital", "ending", "state"),
     [
-        (0, True, Ending(0, "all services have stopped"), "stopped"),
-        (0, False, None, "restarting"),
-        (1, True, None, "restarting"),
-        (2, True, Ending(2, "child: exit 2"), "restarting"),
-        (3, True, Ending(3, "child: exit 3"), "restarting"),
+        (0, True, True, Ending(0, "all services have stopped"), "stopped"),
+        (0, False, True, None, "restarting"),
+        (1, True, True, None, "restarting"),
+        (2, True, True, Ending(2, "child: exit 2"), "restarting"),
+        (3, True, True, Ending(3, "child: exit 3"), "restarting"),
+        (2, False, False, None, "restarting"),
     ],
 )
 def test_only_what_would_come_again_ends_everything(
-    code: int, may_finish: bool, ending: Ending | None, state: str, tmp_path: Path
+    code: int, may_finish: bool, vital: bool, ending: Ending | None, state: str, tmp_path: Path
 ) -> None:
     command = (sys.executable, "-c", f"raise SystemExit({code})")
-    with Supervisor([ChildSpec("child", command, 0, may_finish)], tmp_path, os.environ) as children:
+    spec = ChildSpec("child", command, 0, may_finish, vital)
+    with Supervisor([spec], tmp_path, os.environ) as children:
         os.waitid(os.P_PID, children.pids()["child"], os.WEXITED | os.WNOWAIT)
         assert children.poll() == ending
         (status,) = children.statuses()

@@ -146,6 +146,13 @@ def test_warnings(given: dict[str, Any], expected: str) -> None:
     assert f"! {expected}" in line(view(**given))
 
 
+def test_the_address_of_the_page_is_shown_from_the_first_second() -> None:
+    there = "http://127.0.0.1:17011/#token"
+    assert line(view(page=there)) == f"1:02:05 | page {there} | services are starting"
+    assert there in text(view(page=there))
+    assert "page" not in line(view())
+
+
 def test_the_key_and_what_became_of_it_are_shown() -> None:
     told = "12:00:00 emergency stop sent; robots: r1 stands"
     assert "space" not in text(full())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import threading
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 from builders import make_observation
 from fakes import message
 from starlette.testclient import TestClient, WebSocketTestSession
-from starlette.websockets import WebSocketDisconnect
+from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from services.monitor.heartbeats import Seen, Snapshot
 from services.page import server as module
@@ -20,7 +21,7 @@ from services.page.address import Address
 from services.page.browse import Browser
 from services.page.commands import Command, Desk
 from services.page.folder import Folder
-from services.page.server import Server
+from services.page.server import Link, Server
 from services.page.track import Track
 from services.page.watch import Watch
 from shared.errors import CorridorError
@@ -80,6 +81,31 @@ def test_a_browser_gets_what_is_new_to_it_once_it_has_painted_the_last(
         assert update(socket) == {"number": 3, "sections": {}}  # a sign of life
     with client.websocket_connect("/updates") as socket:
         assert update(socket)["sections"] == {"a": 49, "b": [2]}
+
+
+def test_nothing_is_sent_before_the_last_update_was_painted(
+    watch: Watch, desk: Taken, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("PERIOD_S", "ALIVE_S"):
+        monkeypatch.setattr(module, name, 1e-9)
+    sent: list[str] = []
+
+    class Socket:
+        async def send_text(self, text: str) -> None:
+            sent.append(text)
+
+    async def look() -> None:
+        link = Link(watch, desk, TOKEN, cast(WebSocket, Socket()))
+        sending = asyncio.create_task(link.send())
+        for number in (1, 2, 3):
+            for value in range(200):
+                watch.sections = {"a": f"{number}{value}"}
+                await asyncio.sleep(0)
+            assert len(sent) == number
+            link.take(f'{{"seen": {number}}}')
+        sending.cancel()
+
+    asyncio.run(look())
 
 
 def test_a_browser_that_paints_nothing_is_let_go(

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, cast
 
 import pytest
 from builders import LIFE, OTHER_LIFE, make_observation
 
+from services.page import watch
 from services.page.track import BUMPS, STEP_M, TRAIL, WAITING, Track
+from shared.bus import Bus as RealBus
+from shared.codec import encode
+from shared.keys import ACTION, OBSERVATION, Stream
 from shared.messages import Action
 
 
@@ -67,3 +72,36 @@ def test_a_robot_that_stands_leaves_no_trail() -> None:
     assert len(track.trail) == 1
     track.observe(make_observation(10, x_m=5.0), 0.0)
     assert list(track.trail)[1:] == [None, (5.0, 0.0)]  # nobody saw the way there
+
+
+class Bus:
+    """Hands what is published to whoever listens."""
+
+    def __init__(self) -> None:
+        self.keepers: dict[Stream, Callable[[str | None, bytes], None]] = {}
+
+    def subscribe(
+        self, stream: Stream, ident: str, keep: Callable[[str | None, bytes], None]
+    ) -> None:
+        self.keepers[stream] = keep
+
+
+def test_messages_wait_in_bounded_queues_and_losses_are_counted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(watch, "KEPT", 4)
+    monkeypatch.setattr(watch, "MAX_SENDERS", 1)
+    bus, tracks = Bus(), dict[str, Track]()
+    stamped = watch.Stamped(cast(RealBus, bus))
+    for sequence in range(3):
+        bus.keepers[OBSERVATION]("robot1", encode(make_observation(sequence)))
+        bus.keepers[ACTION]("robot1", encode(make_action(sequence)))
+    bus.keepers[OBSERVATION]("robot2", encode(make_observation(1, robot="robot2")))
+    bus.keepers[OBSERVATION](None, b"")
+    assert stamped.lost == 4  # two of six, one too many robots, one of nobody
+    stamped.into(tracks)
+    assert (len(tracks["robot1"].delays_ms), list(tracks)) == (2, ["robot1"])
+    bus.keepers[ACTION]("robot1", encode(make_action(3, robot="robot2")))
+    bus.keepers[ACTION]("robot1", b"junk")
+    stamped.into(tracks)
+    assert stamped.lost == 6
