@@ -6,7 +6,7 @@ import os
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -21,8 +21,8 @@ from services.cli.options import (
 from services.security.use import using
 
 if TYPE_CHECKING:
-    from services.commander.bundle import Bundle
     from shared.config import Config
+    from shared.provenance import Bundle
 
 DRIVING = ("pilot", "operator")
 """Credentials for driving: those of a pilot, who may send actions."""
@@ -50,6 +50,9 @@ def drive(
     ],
     robot: OneRobot = None,
     actions: Annotated[int, typer.Option(min=0, help="Stop after so many; 0: never.")] = 0,
+    video: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Film it: a new .mp4 or .gif.")
+    ] = None,
 ) -> None:
     """Let a frozen network drive a robot: nothing is learnt, nothing is stored.
 
@@ -69,7 +72,15 @@ def drive(
         file = sources.config or bundle.frozen.configuration_of(network)
         shape = made.network if made else Sources(None, file, sources.set_).load().network
         predictor = found.predictor(shape)
-        raise typer.Exit(command.run(there, predictor, found.path, robot, actions, typer.echo))
+        watch = stack.enter_context(_film(video, there)).add if video else None
+        code = command.run(there, predictor, found.path, robot, actions, typer.echo, watch)
+    raise typer.Exit(code)
+
+
+def _film(file: Path, config: Config) -> Any:
+    """A film of what the robot does, as fast as it does it."""
+    film = import_installed("services.robot_driver.atlas.film", "sim")
+    return film.Film(file, 1.0 / config.robot.period_s)
 
 
 def _alone(
@@ -125,6 +136,12 @@ def record(
     limit_mib: Annotated[
         int, typer.Option(min=1, max=1_000_000, help="End when the file is as large.")
     ] = 4096,
+    last: Annotated[
+        float,
+        typer.Option(
+            min=0.0, max=3600.0, help="Keep so many seconds; write them at SIGUSR1 and at the end."
+        ),
+    ] = 0.0,
     config: ConfigOption = None,
 ) -> None:
     """Record what a run publishes and its weights as MCAP, until Ctrl-C.
@@ -137,10 +154,12 @@ def record(
     else:
         loaded = which.reach(*kinds)
     service = import_installed("services.recorder.service", "record")
+    from services.robot_driver.simulated.world import solids
     from shared.service import setup_logging
 
     setup_logging("recorder", None)
-    raise typer.Exit(service.run(loaded, which.folder(loaded), out, limit_mib, typer.echo))
+    order = service.Order(out, limit_mib, last, solids)
+    raise typer.Exit(service.run(loaded, which.folder(loaded), order, typer.echo))
 
 
 def playback(

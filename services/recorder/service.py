@@ -1,13 +1,25 @@
-"""The recorder: hears everything a run publishes, fetches every version of the weights, writes."""
+"""The recorder: hears everything a run publishes, fetches every version of the weights, writes.
+
+It writes as it hears, or keeps the last seconds in memory and writes those each time it gets the
+signal SIGUSR1, and at its end.
+"""
 
 from __future__ import annotations
 
+import math
+import os
+import signal
+import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 from services.recorder.recording import RECORDED, Origin, RecordingWriter
+from services.recorder.ring import Ring
 from services.recorder.tap import Tap
+from services.recorder.views import Solids, no_solids
 from shared.config import Config, Numerics
 from shared.errors import ConfigError, StateError
 from shared.numerics import known
@@ -20,20 +32,24 @@ TELL_S = 10.0
 MIB = 1024 * 1024
 
 
-def run(
-    config: Config, folder: Path, path: Path, limit_mib: int, echo: Callable[[str], None]
-) -> int:
-    """Record until stopped, or until the file is as large as it may be.
+@dataclass(frozen=True)
+class Order:
+    """What is to be recorded, and where to."""
 
-    Args:
-        config: Of the run.
-        folder: Of the run: the numerics that were chosen for its actor are there.
-        path: File to write.
-        limit_mib: Largest file.
-        echo: Shows a line.
+    path: Path
+    limit_mib: int
+    """Largest file."""
+    last_s: float = 0.0
+    """If above 0: keep so many seconds, and write them when told to."""
+    solids: Solids = no_solids
+    """What stands in a world."""
 
-    Returns:
-        The exit code.
+
+def run(config: Config, folder: Path, order: Order, echo: Callable[[str], None]) -> int:
+    """Record a run until stopped, or until the file is as large as it may be.
+
+    folder: of the run: the numerics that were chosen for its actor are there; echo: shows a line.
+    Returns the exit code.
 
     Raises:
         ConfigError: The numerics of the actor are not known, the file cannot be made, or the run
@@ -41,16 +57,49 @@ def run(
         StateError: The file cannot be written any more.
     """
     origin = Origin(config, actor_numerics(config, folder))
+    record = _keep if order.last_s else _write
     try:
-        with service("recorder", "main", config) as me, RecordingWriter(path, origin) as writer:
-            echo(f"recording run {config.run.name!r} to {path}; Ctrl-C ends it")
-            Recorder(me, writer, limit_mib * MIB, echo).run()
+        with service("recorder", "main", config) as me:
+            record(me, order, origin, echo)
     except OSError as error:
-        raise StateError(f"--out: {path}: cannot be written: {error.strerror}") from error
+        raise StateError(f"--out: {order.path}: cannot be written: {error.strerror}") from error
     except Stopped:
         echo(f"nothing recorded: stopped while there was no router at {config.bus.endpoint}")
         return EXIT_CRASH
     return 0
+
+
+def _write(me: Service, order: Order, origin: Origin, echo: Callable[[str], None]) -> None:
+    """Write all that is heard."""
+    with RecordingWriter(order.path, origin, order.solids) as writer:
+        echo(f"recording run {me.config.run.name!r} to {order.path}; Ctrl-C ends it")
+        recorder = Recorder(me, writer, echo, order.limit_mib * MIB)
+        recorder.run()
+        writer.add_summary(recorder.counts())
+
+
+def _keep(me: Service, order: Order, origin: Origin, echo: Callable[[str], None]) -> None:
+    """Keep what is heard; write it to the next file at every signal and at the end."""
+    path, ring, wanted = order.path, Ring(order.last_s), threading.Event()
+
+    def on_signal(*_: object) -> None:
+        wanted.set()
+        recorder.wake()
+
+    def write() -> None:
+        wanted.clear()
+        files = (path.with_name(f"{path.stem}-{number}{path.suffix}") for number in count(1))
+        file = next(file for file in files if not file.exists())
+        with RecordingWriter(file, origin, order.solids) as writer:
+            ring.write(writer)
+            writer.add_summary(recorder.counts())
+        echo(f"{file}: {writer.messages} messages")
+
+    recorder = Recorder(me, ring, echo, each=lambda: write() if wanted.is_set() else None)
+    signal.signal(signal.SIGUSR1, on_signal)
+    echo(f"keeping the last seconds; kill -USR1 {os.getpid()} writes them, Ctrl-C ends it")
+    recorder.run()
+    write()
 
 
 def actor_numerics(config: Config, folder: Path) -> Numerics:
@@ -67,12 +116,20 @@ class Recorder:
     """One thread: takes what was heard, writes it, and says how much that was."""
 
     def __init__(
-        self, me: Service, writer: RecordingWriter, limit: int, echo: Callable[[str], None]
+        self,
+        me: Service,
+        writer: RecordingWriter | Ring,
+        echo: Callable[[str], None],
+        limit: float = math.inf,
+        each: Callable[[], None] = lambda: None,
     ) -> None:
-        self._me, self._writer, self._limit, self._echo = me, writer, limit, echo
+        """limit: most bytes of a file; each: called again and again."""
+        self._me, self._writer, self._echo, self._limit = me, writer, echo, limit
+        self._each = each
         self._tap = Tap(me.bus, RECORDED)
-        self._fetcher = WeightsFetcher(me, self._tap.wake)
-        me.stop.on_set(self._tap.wake)
+        self.wake = self._tap.wake
+        self._fetcher = WeightsFetcher(me, self.wake)
+        me.stop.on_set(self.wake)
         self._version = self._versions = self._skipped = 0
         self._started_s = time.monotonic()
 
@@ -89,10 +146,10 @@ class Recorder:
                 tell_s = now_s + TELL_S
                 self._echo(str(self))
             if self._writer.size >= self._limit:
-                self._echo(f"the file has {self._limit // MIB} MiB: the recording ends here")
+                self._echo(f"the file has {self._limit / MIB:.0f} MiB: the recording ends here")
                 break
+            self._each()
         self._take(0.0)
-        self._writer.add_summary(self.counts())
         self._echo(str(self))
 
     def counts(self) -> dict[str, int]:

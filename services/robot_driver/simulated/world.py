@@ -9,6 +9,7 @@ Units are metres and degrees, x to the right and y up on the map.
 from __future__ import annotations
 
 import hashlib
+import math
 import tomllib
 from collections.abc import Collection
 from functools import cached_property
@@ -34,7 +35,9 @@ from services.robot_driver.simulated.world_parts import (
     Wall,
     inside,
 )
+from shared import plugins
 from shared.errors import ConfigError, first_problem
+from shared.messages import Box
 
 WORLDS = Path(__file__).parent / "worlds"
 """Folder of the worlds that come with the driver."""
@@ -270,18 +273,46 @@ def world_path(name: str) -> Path:
     if name.endswith(".toml"):
         return Path(name)
     files = world_files()
-    if name not in files:
-        raise WorldError(f"no world named {name!r}; there are: {', '.join(files)}")
-    return files[name]
+    if name in files:
+        return files[name]
+    try:
+        return Path(plugins.load(plugins.WORLDS, name))
+    except KeyError:
+        others = plugins.names(plugins.WORLDS)
+        there = ", ".join((*files, *others))
+        raise WorldError(f"no world named {name!r}; there are: {there}") from None
 
 
 def load_world(name: str) -> World:
-    """The world of that name: one that comes with the driver, or one in `worlds/`.
+    """The world of that name: one that comes along, one in `worlds/`, or another package's.
 
     Raises:
         WorldError: There is none of that name, or its file is wrong.
     """
     return read_world(world_path(name))
+
+
+def solids(name: str) -> list[Box]:
+    """The walls and boxes of a world, for pictures of it; none where it cannot be read."""
+    try:
+        world = load_world(name)
+    except WorldError:
+        return []
+    found = [Box.model_validate(obstacle.model_dump()) for obstacle in world.obstacles]
+    for wall in world.walls:
+        for i, (ax, ay, bx, by) in enumerate(wall.segments.tolist()):
+            side = Box(
+                name=f"{wall.name}-{i}",
+                x_m=(ax + bx) / 2,
+                y_m=(ay + by) / 2,
+                heading_deg=math.degrees(math.atan2(by - ay, bx - ax)),
+                length_m=math.hypot(bx - ax, by - ay),
+                width_m=0.02,
+                height_m=world.height_m,
+                rgb=world.textures[wall.texture_of(i)].rgb,
+            )
+            found.append(side)
+    return found
 
 
 def read_world(path: Path) -> World:
