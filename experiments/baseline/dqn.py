@@ -19,20 +19,16 @@ needs Stable-Baselines3 (`make bench-peers` installs it into `.venv-peers`).
 from __future__ import annotations
 
 import importlib.util
-import math
 import time
-from collections import deque
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import gymnasium
-import numpy as np
 import typer
 from gymnasium.wrappers import TimeLimit
 
 from experiments.drives.choosers import Chooser
 from experiments.drives.frozen_drives import evaluate
-from experiments.environment import CorridorEnv, Image
+from experiments.environment import REWARDS, CorridorEnv
 from experiments.plans.plan import Plan, stage_config
 from experiments.plans.scales import divisor_of, load_plan
 from experiments.records import EVALUATION_COLUMNS
@@ -41,7 +37,7 @@ from shared.errors import ConfigError
 from shared.run_record import RunInfo, StageInfo, append_csv, made_here, now_utc, write_csv
 from shared.statefile import write_atomically
 
-NAMES = {"progress": "dqn-progress", "distance": "dqn-distance"}
+NAMES = {reward: f"dqn-{reward}" for reward in REWARDS}
 """Name of the experiment, by its reward."""
 STAGE = "learn"
 TARGET_EVERY = 1000
@@ -49,37 +45,6 @@ TARGET_EVERY = 1000
 EVALUATIONS = 10
 """In a run, at equal intervals."""
 EXIT_USAGE = 2
-
-
-class DistanceReward(gymnasium.Wrapper[Image, np.int64, Image, np.int64]):
-    """Rewards distance from where the robot was some actions ago; -1 at a bump stays.
-
-    Until there are so many actions in an episode its first place counts.
-    """
-
-    def __init__(self, env: gymnasium.Env[Image, np.int64], config: Config) -> None:
-        super().__init__(env)
-        self._max_distance_m = config.max_distance_m
-        self._places: deque[tuple[float, float]] = deque(maxlen=config.episode.horizon + 1)
-
-    def reset(self, **given: Any) -> tuple[Image, dict[str, Any]]:
-        """Begin an episode."""
-        image, info = self.env.reset(**given)
-        self._places.clear()
-        self._remember(info)
-        return image, info
-
-    def step(self, action: np.int64) -> tuple[Image, float, bool, bool, dict[str, Any]]:
-        """Drive one action."""
-        image, reward, terminated, truncated, info = self.env.step(action)
-        if not terminated:
-            self._remember(info)
-            reward = math.dist(self._places[0], self._places[-1]) / self._max_distance_m
-        return image, float(reward), terminated, truncated, info
-
-    def _remember(self, info: dict[str, Any]) -> None:
-        seen = info["observation"]
-        self._places.append((seen.x_m, seen.y_m))
 
 
 class Dqn:
@@ -90,10 +55,8 @@ class Dqn:
 
         self._sb3 = sb3
         sb3.use_threads(config.numerics.learner.threads)
-        env: gymnasium.Env[Image, np.int64] = CorridorEnv(config=config)
-        if reward == "distance":
-            env = DistanceReward(env, config)
         self._random = config.memory.capacity
+        env = CorridorEnv(config=config, reward=reward)
         self._model = sb3.dqn(
             TimeLimit(env, config.episode.max_samples), config,
             random_steps=self._random, target_update_interval=TARGET_EVERY,

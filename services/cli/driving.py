@@ -6,7 +6,7 @@ import os
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -72,15 +72,12 @@ def drive(
         file = sources.config or bundle.frozen.configuration_of(network)
         shape = made.network if made else Sources(None, file, sources.set_).load().network
         predictor = found.predictor(shape)
-        watch = stack.enter_context(_film(video, there)).add if video else None
+        watch = None
+        if video:
+            film = import_installed("services.robot_driver.atlas.film", "sim")
+            watch = stack.enter_context(film.filming(video, 1.0 / there.robot.period_s)).add
         code = command.run(there, predictor, found.path, robot, actions, typer.echo, watch)
     raise typer.Exit(code)
-
-
-def _film(file: Path, config: Config) -> Any:
-    """A film of what the robot does, as fast as it does it."""
-    film = import_installed("services.robot_driver.atlas.film", "sim")
-    return film.Film(file, 1.0 / config.robot.period_s)
 
 
 def _alone(
