@@ -33,19 +33,15 @@ class MetricsLog:
     """One CSV file whose first column is the global episode number, and whose last is never empty.
 
     A restarted writer says which rows are certain; everything later is written again. Trackers of
-    other packages get every row. One that raises gets no more.
-
-    Args:
-        path: The file.
-        columns: Of it.
-        config: Shown by TensorBoard as hyper-parameters.
+    other packages get every row. One that raises gets no more. TensorBoard shows `config`.
     """
 
     def __init__(self, path: Path, columns: tuple[str, ...], config: Config | None = None) -> None:
         self._path, self._columns, self._config = path, columns, config
         self._board: Any = None
-        names = plugins.names(plugins.TRACKERS)
-        self._trackers = {name: plugins.load(plugins.TRACKERS, name) for name in names}
+        self._trackers = {
+            name: plugins.load(plugins.TRACKERS, name) for name in plugins.names(plugins.TRACKERS)
+        }
 
     def restart(self, rows: Iterable[Row]) -> None:
         """Begin anew with exactly these rows."""
@@ -74,15 +70,11 @@ class MetricsLog:
 
     def show_network(self, episode: int, network: QNetwork, images: npt.NDArray[np.uint8]) -> None:
         """Show weights as histograms, and images [n, 50, 75] above what is predicted for them."""
-        try:
+        with suppress(OSError):
             board = self._opened()
+            board.add_images("probes", _probes(network, images), episode)
             for name, parameter in network.named_parameters():
-                board.add_histogram(f"weights/{name}", parameter.detach().cpu(), episode)
-            if len(images):
-                board.add_images("probes", _probes(network, images), episode)
-        except OSError as error:
-            log.warning("TensorBoard lacks the network of episode %d: %s", episode, error)
-            self._board = None
+                board.add_histogram(f"weights/{name}", parameter, episode)
 
     def _show(self, episode: int, row: Row) -> None:
         board = self._opened()
@@ -98,10 +90,7 @@ class MetricsLog:
             self._board = SummaryWriter(str(folder), flush_secs=10)
             if self._config is not None:
                 flat = flatten(self._config.to_dict())
-                shown = {
-                    k: v if isinstance(v, int | float | str) else str(v) for k, v in flat.items()
-                }
-                for summary in hparams(shown, {}):  # type: ignore[no-untyped-call]
+                for summary in hparams({k: str(v) for k, v in flat.items()}, {}):  # type: ignore[no-untyped-call]
                     self._board.file_writer.add_summary(summary)
         return self._board
 
@@ -115,14 +104,10 @@ class MetricsLog:
 @torch.no_grad()
 def _probes(network: QNetwork, images: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     """Images with a bar for each action below: empty for -1, full for 1; uint8 [n, 1, h, 75]."""
-    device = next(network.parameters()).device
-    pixels = torch.from_numpy(images).to(device).unsqueeze(1).float() / 255
+    pixels = torch.from_numpy(images).to(network.action_vectors.device).unsqueeze(1).float() / 255
     values = network.all_values(network.maps(pixels)).clamp(-1, 1).cpu().numpy()
-    count, height, width = images.shape
-    shown = np.zeros((count, 1, height + BAR_PX * values.shape[1], width), np.uint8)
-    shown[:, 0, :height] = images
-    for number, action in np.ndindex(*values.shape):
-        top = height + BAR_PX * action
-        full = round(width * float(values[number, action] + 1) / 2)
-        shown[number, 0, top + 1 : top + BAR_PX - 1, :full] = 255
-    return shown
+    width = images.shape[2]
+    full = np.arange(width) < width * (values[:, :, np.newaxis] + 1) / 2
+    bars = np.repeat(np.where(full, 255, 0), BAR_PX, axis=1)
+    bars[:, ::BAR_PX] = 0
+    return np.concatenate([images, bars.astype(np.uint8)], axis=1)[:, np.newaxis]

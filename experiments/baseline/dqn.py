@@ -32,7 +32,7 @@ from experiments.environment import REWARDS, CorridorEnv
 from experiments.plans.plan import Plan, stage_config
 from experiments.plans.scales import divisor_of, load_plan
 from experiments.records import EVALUATION_COLUMNS
-from shared.config import Config
+from shared.config import Config, LearnerNumerics, NumericsConfig, RunConfig
 from shared.errors import ConfigError
 from shared.run_record import RunInfo, StageInfo, append_csv, made_here, now_utc, write_csv
 from shared.statefile import write_atomically
@@ -124,18 +124,10 @@ def shared_config(like: Plan, seed: int, reward: str, threads: int) -> Config:
     """What the baseline has in common with the last stage of a plan. Raises ConfigError."""
     if reward not in NAMES:
         raise ConfigError(f"--reward: expected one of {', '.join(NAMES)}, got {reward!r}")
+    run, learner = RunConfig(name=NAMES[reward], seed=seed), LearnerNumerics(threads=threads)
+    numerics = NumericsConfig(learner=learner)
     ours = stage_config(like, len(like.stages) - 1, seed)
-    return Config.model_validate(
-        {
-            "run": {"name": NAMES[reward], "seed": seed},
-            "robot": ours.robot.model_dump(),
-            "episode": ours.episode.model_dump(),
-            "policy": {"kind": "eps-greedy", "epsilon": ours.policy.epsilon},
-            "network": ours.network.model_dump(),
-            "memory": {"capacity": ours.memory.capacity, "strategy": "normm"},
-            "numerics": {"learner": {"threads": threads}},
-        }
-    )
+    return ours.model_copy(update={"run": run, "numerics": numerics})
 
 
 app = typer.Typer(add_completion=False)

@@ -13,7 +13,7 @@ from services.extras import import_installed
 from services.robot_driver.atlas.film import MAX_GIF_FRAMES, filming
 from shared.config import Config
 from shared.errors import ConfigError
-from shared.messages import Action, Message, Observation, image_array
+from shared.messages import Action, Observation, image_array
 from shared.rl.draws import generator
 from shared.rl.policy import choose_greedily
 
@@ -44,32 +44,25 @@ def run(source: Path, out: Path, world: str | None, frames: int, parts: int, spe
 
 def _film_recording(source: Path, out: Path, frames: int, parts: int, speed: float) -> None:
     recording = import_installed("services.recorder.reader", "record").Recording(source)
-    total = sum(1 for _ in _turns(recording.messages()))
+    robot = next((action.robot for _, action in recording.turns()), "")
+
+    def turns() -> Iterator[tuple[Observation, Action]]:
+        for seen, action in recording.turns():
+            if seen is not None and action.robot == robot:
+                yield seen, action
+
+    total = sum(1 for _ in turns())
     each = min(frames // parts, total // parts)
     if not each:
         raise ConfigError(f"{source}: {total} actions with their observations, for {parts} parts")
     begins = [round(part * (total - each) / max(parts - 1, 1)) for part in range(parts)]
     with filming(out, speed / recording.origin.config.robot.period_s) as film:
-        for number, (seen, action) in enumerate(_turns(recording.messages())):
+        for number, (seen, action) in enumerate(turns()):
             if number in begins:
                 film.cut()
             if any(begin <= number < begin + each for begin in begins):
                 when = "filling" if action.filling else f"episode {action.episode}"
                 film.add(seen, action.values, action.action, f"action {number + 1:,}  {when}")
-
-
-def _turns(messages: Iterator[Message]) -> Iterator[tuple[Observation, Action]]:
-    """Actions of the first robot with the observations that they answer."""
-    seen: Observation | None = None
-    robot = ""
-    for message in messages:
-        if isinstance(message, Observation) and message.robot == (robot := robot or message.robot):
-            seen = message
-        elif isinstance(message, Action) and seen is not None:
-            answered = (message.robot, message.robot_life, message.sequence, message.attempt)
-            if answered == (seen.robot, seen.life, seen.sequence, seen.attempt):
-                yield seen, message
-                seen = None
 
 
 def _film_drive(source: Path, out: Path, world: str | None, frames: int, speed: float) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import re
 import struct
+from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BufferedReader, FileIO
@@ -44,6 +45,9 @@ MAX_CHUNK_BYTES = 16 * 1024 * 1024
 MAX_WEIGHTS_BYTES = 64 * 1024 * 1024
 MAX_VERSIONS = 1_000_000
 NUMBER = re.compile(r"[0-9]{1,18}")
+KEPT_OBSERVATIONS = 256
+"""Observations kept for all robots together. An action follows its observation closely."""
+Place = tuple[str, str, int, int]
 
 
 class _File(BufferedReader):
@@ -139,6 +143,18 @@ class Recording:
                 if message is not None:
                     yield message
                 self.undecodable += message is None
+
+    def turns(self) -> Iterator[tuple[m.Observation | None, m.Action]]:
+        """All actions, each with the observation that it answers, if that is there."""
+        seen: OrderedDict[Place, m.Observation] = OrderedDict()
+        for message in self.messages():
+            if isinstance(message, m.Observation):
+                seen[(message.robot, message.life, message.sequence, message.attempt)] = message
+                if len(seen) > KEPT_OBSERVATIONS:
+                    seen.popitem(last=False)
+            elif isinstance(message, m.Action):
+                place = (message.robot, message.robot_life, message.sequence, message.attempt)
+                yield seen.get(place), message
 
     def load(self, version: int) -> bytes:
         """The safetensors bytes of a version, as they were written. Raises StateError."""

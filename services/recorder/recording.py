@@ -25,7 +25,7 @@ from typing import BinaryIO, Self
 from foxglove import Schema
 from mcap.writer import Writer
 
-from services.recorder.tap import Heard
+from services.recorder.tap import Heard, Version
 from services.recorder.views import Solids, View, Views, no_solids
 from shared.codec import decode
 from shared.config import Config, Numerics
@@ -103,23 +103,22 @@ class RecordingWriter:
         """Bytes so far."""
         return self._file.tell()
 
-    def add(self, heard: Heard) -> None:
-        """Write a message, and what other tools show of it."""
-        stream = heard.stream
-        raw = View(stream.key(self._run, heard.ident), _schema(stream), heard.data, ENCODING)
-        if not self._write(raw, heard.time_ns):
+    def add(self, new: Heard | Version) -> None:
+        """Write a version of the target network, or a message and what other tools show of it."""
+        if isinstance(new, Version):
+            name, media_type = f"{WEIGHTS}{new.number}", "application/octet-stream"
+            self._writer.add_attachment(new.time_ns, new.time_ns, name, media_type, new.data)
+            return
+        stream = new.stream
+        raw = View(stream.key(self._run, new.ident), _schema(stream), new.data, ENCODING)
+        if not self._write(raw, new.time_ns):
             self.refused += 1
             return
         self.messages += 1
         if stream in (OBSERVATION, ACTION):
             with suppress(BadMessage):  # playback counts it
-                for view in self._views.of(decode(heard.data, stream.request), heard.time_ns):
-                    self._write(view, heard.time_ns)
-
-    def add_weights(self, version: int, data: bytes, time_ns: int) -> None:
-        """Write a version of the target network, given as safetensors bytes."""
-        media_type = "application/octet-stream"
-        self._writer.add_attachment(time_ns, time_ns, f"{WEIGHTS}{version}", media_type, data)
+                for view in self._views.of(decode(new.data, stream.request), new.time_ns):
+                    self._write(view, new.time_ns)
 
     def add_summary(self, counts: dict[str, int]) -> None:
         """Write how much there is, and how much was lost."""

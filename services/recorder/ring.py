@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import deque
 
 from services.recorder.recording import RecordingWriter
-from services.recorder.tap import Heard
+from services.recorder.tap import Heard, Version
 
-MAX_BYTES = 256 * 1024 * 1024
-"""Of messages, and of weights: what is older goes first, and is counted."""
+MAX_BYTES = 512 * 1024 * 1024
+"""What is older goes first, and is counted."""
 
 
 class Ring:
@@ -19,42 +19,33 @@ class Ring:
 
     def __init__(self, last_s: float) -> None:
         self._last_ns = int(last_s * 1e9)
-        self._messages: deque[Heard] = deque()
-        self._weights: deque[tuple[int, bytes, int]] = deque()
-        self.size = self._weight_bytes = 0
-        """Bytes of messages, and of weights."""
-        self.messages = self.refused = 0
-        """Messages kept, and those that went before their time: there is no room."""
+        self._kept: deque[Heard | Version] = deque()
+        self._weights: deque[Version] = deque(maxlen=2)
+        self.size = self.refused = 0
+        """Bytes; messages that went before their time, because there was no room."""
 
-    def add(self, heard: Heard) -> None:
-        """Keep a message."""
-        self._messages.append(heard)
-        self.size += len(heard.data)
-        start_ns = heard.time_ns - self._last_ns
-        while self._messages[0].time_ns < start_ns or self.size > MAX_BYTES:
-            gone = self._messages.popleft()
+    @property
+    def messages(self) -> int:
+        """How many are kept."""
+        return sum(isinstance(each, Heard) for each in self._kept)
+
+    def add(self, new: Heard | Version) -> None:
+        """Keep a message, or a version of the target network."""
+        self._kept.append(new)
+        self.size += len(new.data)
+        start_ns = new.time_ns - self._last_ns
+        while self._kept[0].time_ns < start_ns or self.size > MAX_BYTES:
+            gone = self._kept.popleft()
             self.size -= len(gone.data)
-            self.refused += gone.time_ns >= start_ns
-        while len(self._weights) > 2 and self._weights[2][2] < start_ns:
-            self._forget()
-        self.messages = len(self._messages)
-
-    def add_weights(self, version: int, data: bytes, time_ns: int) -> None:
-        """Keep a version of the target network."""
-        self._weights.append((version, data, time_ns))
-        self._weight_bytes += len(data)
-        while self._weight_bytes > MAX_BYTES:
-            self._forget()
+            if isinstance(gone, Version):
+                self._weights.append(gone)
+            else:
+                self.refused += gone.time_ns >= start_ns
 
     def write(self, writer: RecordingWriter) -> None:
         """Write all that is kept; it stays."""
-        for version, data, time_ns in self._weights:
-            writer.add_weights(version, data, time_ns)
-        for heard in self._messages:
-            writer.add(heard)
+        for each in (*self._weights, *self._kept):
+            writer.add(each)
 
     def flush(self) -> None:
         """Nothing: memory needs none."""
-
-    def _forget(self) -> None:
-        self._weight_bytes -= len(self._weights.popleft()[1])

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from services.recorder.recording import RECORDED, Origin, RecordingWriter
 from services.recorder.ring import Ring
-from services.recorder.tap import Tap
+from services.recorder.tap import Tap, Version
 from services.recorder.views import Solids, no_solids
 from shared.config import Config, Numerics
 from shared.errors import ConfigError, StateError
@@ -178,5 +178,5 @@ class Recorder:
         version, data = self._fetcher.newest
         if version > self._version:
             self._skipped += version - self._version - 1 if self._version else 0
-            self._writer.add_weights(version, data, time.time_ns())
+            self._writer.add(Version(version, time.time_ns(), data))
             self._version, self._versions = version, self._versions + 1

@@ -27,7 +27,7 @@ from services.recorder.reader import MAX_CHUNK_BYTES, MAX_RECORD_BYTES, Recordin
 from services.recorder.recording import Origin, RecordingWriter
 from services.recorder.ring import Ring
 from services.recorder.service import actor_numerics
-from services.recorder.tap import Heard
+from services.recorder.tap import Heard, Version
 from services.robot_driver.simulated.world import solids
 from shared.codec import encode
 from shared.config import ActorNumerics, Config
@@ -101,7 +101,7 @@ def write(path: Path, turns: list[tuple[Observation, Action]], **kwargs: Any) ->
             writer.add(heard(observation, 2 * i))
             writer.add(heard(action, 2 * i + 1))
         for version, data in WEIGHTS.items():
-            writer.add_weights(version, data, 9)
+            writer.add(Version(version, 9, data))
         writer.add_summary({"messages": writer.messages, "lost.observation": 0})
     return path
 
@@ -197,7 +197,7 @@ def test_the_last_seconds_are_kept_with_the_weights_they_need(
     ring = Ring(last_s=2.0)
     for second, (observation, action) in enumerate(turns[10:16]):
         if second in (0, 1, 2):
-            ring.add_weights(second, WEIGHTS[1 + second % 2], int(second * 1e9))
+            ring.add(Version(second, int(second * 1e9), WEIGHTS[1 + second % 2]))
         ring.add(heard(observation, int(second * 1e9)))
         ring.add(heard(action, int(second * 1e9)))
     path = tmp_path / "last.mcap"
@@ -374,7 +374,7 @@ def test_damaged_weights_are_refused(tmp_path: Path, turns: Any) -> None:
     with RecordingWriter(path, Origin(CONFIG, NUMERICS)) as writer:
         writer.add(heard(turns[20][0]))
         writer.add(heard(turns[20][1]))
-        writer.add_weights(2, WEIGHTS[2][:-8], 0)
+        writer.add(Version(2, 0, WEIGHTS[2][:-8]))
     with pytest.raises(StateError, match="recorded weights of version 2"):
         playback.compare(Recording(path))
 
