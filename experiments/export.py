@@ -28,7 +28,7 @@ from shared.rl.memory import Images, ReplayMemory
 from shared.rl.network import HIDDEN, QNetwork, load_bytes
 from shared.run_record import read_episodes
 
-OPSET, IR_VERSION = 17, 8
+OPSET, IR_VERSION = helper.make_opsetid("", 17), 8
 """Old enough for every runtime of the last years."""
 TOLERANCE = 1e-5
 """Predictions of the ONNX file may differ by this from ours."""
@@ -139,16 +139,16 @@ def _graph(network: QNetwork) -> onnx.ModelProto:
 
     def add(op: str, *values: npt.ArrayLike, **attributes: Any) -> None:
         """A node after the last one; the values are constants."""
-        names = [f"constant-{len(constants) + number}" for number in range(len(values))]
-        before = nodes[-1].output[0] if nodes else "images"
+        inputs = [nodes[-1].output[0] if nodes else "images"]
         after = "values" if op == "Clip" else f"{op}-{len(nodes)}"
-        for name, value in zip(names, values, strict=True):
-            constants.append(numpy_helper.from_array(np.asarray(value), name))
-        nodes.append(helper.make_node(op, [before, *names], [after], **attributes))
+        for value in values:
+            inputs.append(f"constant-{len(constants)}")
+            constants.append(numpy_helper.from_array(np.asarray(value), inputs[-1]))
+        nodes.append(helper.make_node(op, inputs, [after], **attributes))
 
     add("Cast", to=TensorProto.FLOAT)
     add("Div", np.float32(255))
-    add("Unsqueeze", np.array([1]))
+    add("Unsqueeze", [1])
     for number, pooled in enumerate(network.pooled, start=1):
         add("Conv", p[f"conv{number}.weight"], p[f"conv{number}.bias"])
         if pooled:
@@ -158,15 +158,14 @@ def _graph(network: QNetwork) -> onnx.ModelProto:
     add("Gemm", p["fconn1.weight"], p["fconn1.bias"], transB=1)
     add("Relu")
     add("MatMul", of_image.T)
-    add("Unsqueeze", np.array([1]))
+    add("Unsqueeze", [1])
     add("Add", np.maximum(encoded, 0) @ of_action.T + p["fconn3.bias"])
     add("Relu")
     add("MatMul", p["out.weight"].T)
-    add("Squeeze", np.array([2]))
+    add("Squeeze", [2])
     add("Add", p["out.bias"])
     add("Clip", np.float32(-1), np.float32(1))
     images = helper.make_tensor_value_info("images", TensorProto.UINT8, ["n", *IMAGE_SHAPE])
     values = helper.make_tensor_value_info("values", TensorProto.FLOAT, ["n", len(ACTIONS)])
     graph = helper.make_graph(nodes, "corridor", [images], [values], constants)
-    opset = [helper.make_opsetid("", OPSET)]
-    return helper.make_model(graph, opset_imports=opset, ir_version=IR_VERSION)
+    return helper.make_model(graph, opset_imports=[OPSET], ir_version=IR_VERSION)

@@ -23,6 +23,7 @@ import time
 from pathlib import Path
 from typing import Annotated
 
+import torch
 import typer
 from gymnasium.wrappers import TimeLimit
 
@@ -53,8 +54,7 @@ class Dqn:
     def __init__(self, config: Config, reward: str) -> None:
         from experiments.baseline import sb3
 
-        self._sb3 = sb3
-        sb3.use_threads(config.numerics.learner.threads)
+        torch.set_num_threads(config.numerics.learner.threads)
         self._random = config.memory.capacity
         env = CorridorEnv(config=config, reward=reward)
         self._model = sb3.dqn(
@@ -77,7 +77,7 @@ class Dqn:
     @property
     def train_steps(self) -> int:
         """Mini-batches trained so far."""
-        return self._sb3.mini_batches(self._model)
+        return int(self._model._n_updates)
 
 
 def run(config: Config, info: RunInfo, learner: Dqn, drives: tuple[int, int], out: Path) -> None:

@@ -19,19 +19,10 @@ from shared.rl.policy import choose_greedily
 
 
 def run(source: Path, out: Path, world: str | None, frames: int, parts: int, speed: float) -> str:
-    """Film a source; returns a line about it.
+    """Film a recording (`.mcap`), or the network of a run in a world; returns a line about it.
 
-    Args:
-        source: A recording (`.mcap`), the folder of a run, or its weights.
-        out: New file, `.mp4` or `.gif`.
-        world: Where to drive with a network; None: in the one it learnt in.
-        frames: Most of them, one an action.
-        parts: A recording is shown in so many parts, spread evenly over all of it.
-        speed: How many times faster than it was.
-
-    Raises:
-        ConfigError: There is no such source, or the film cannot be written.
-        StateError: The source is damaged.
+    A recording is shown in so many parts, spread evenly over all of it; one frame is one action.
+    Raises ConfigError or StateError where there is no such source, or it or the file is unfit.
     """
     if out.suffix == ".gif":
         frames = min(frames, MAX_GIF_FRAMES)
