@@ -207,10 +207,7 @@ def env_id(world: str) -> str:
 
 
 def register(world: str | Path) -> str:
-    """Register the environment of a world, such as one of your own; returns its id.
-
-    world: Its name, or the path of its file.
-    """
+    """Register the environment of a world, given by name or file; returns its id."""
     name = env_id(Path(world).stem)
     gymnasium.register(
         id=name,

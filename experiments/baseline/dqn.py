@@ -1,19 +1,7 @@
 """A baseline: DQN of Stable-Baselines3 learns in the same corridor, evaluated as ours is (E34).
 
-Equal to a plan of ours are the environment, the convolutions with their first weights, memory,
-mini-batch, constant exploration, the random actions before learning, and the number of actions.
-Different are what makes it DQN: one output per action instead of actions as an input, a discount
-factor and bootstrapped values, and its optimiser and update frequencies, which are
-Stable-Baselines3's defaults except for the target network, copied every 1,000 actions because runs
-are short.
-
-Reward `progress` is the environment's own: how far the action led, -1 at a bump. It does not tell
-driving from circling. Reward `distance` comes nearer to ours: how far the robot is from where it
-was 50 actions ago, of the farthest possible.
-
-    python -m experiments.baseline.dqn --like plus-rmm --actions 50000 --seed 1 --out DIR
-
-needs Stable-Baselines3 (`make bench-peers` installs it into `.venv-peers`).
+docs/evaluation.md tells what is equal to a plan of ours and what is not. It needs
+Stable-Baselines3, which `make bench-peers` installs into `.venv-peers`.
 """
 
 from __future__ import annotations

@@ -55,14 +55,10 @@ class Comparison:
 
 
 def run(path: Path, echo: Callable[[str], None]) -> int:
-    """Play a recording back, print the comparison.
+    """Play a recording back; 0 if all compared actions are equal, 1 if not, or if there are none.
 
-    Returns:
-        0 if all actions compared are equal, 1 if not, or if none could be compared.
-
-    Raises:
-        ConfigError: No such file, or made for another version or with an engine not installed here.
-        StateError: It is no recording, or damaged.
+    Raises ConfigError for no file, or one for another version or an engine that is not installed
+    here; StateError for a damaged one.
     """
     recording = Recording(path)
     if not recording.complete:

@@ -45,6 +45,7 @@ MAX_CHUNK_BYTES = 16 * 1024 * 1024
 MAX_WEIGHTS_BYTES = 64 * 1024 * 1024
 MAX_VERSIONS = 1_000_000
 NUMBER = re.compile(r"[0-9]{1,18}")
+WEIGHTS_NAME = re.compile(rf"{WEIGHTS}([0-9]{{1,18}})")
 KEPT_OBSERVATIONS = 256
 """Observations kept for all robots together. An action follows its observation closely."""
 Place = tuple[str, str, int, int]
@@ -90,12 +91,8 @@ class _Reader(StreamReader):
 class Recording:
     """A recording in a file; every pass over it begins anew.
 
-    Args:
-        path: The file.
-
-    Raises:
-        ConfigError: There is no such file.
-        StateError: It is no recording of this project, or is damaged at its beginning.
+    Raises ConfigError if there is none, StateError if it is no recording of this project, or is
+    damaged at its beginning.
     """
 
     def __init__(self, path: Path) -> None:
@@ -116,8 +113,10 @@ class Recording:
                 elif record.name == SUMMARY:
                     numbers = {k: v for k, v in record.metadata.items() if NUMBER.fullmatch(v)}
                     self.summary = {name: int(text) for name, text in numbers.items()}
-            elif isinstance(record, Attachment):
-                self._note_weights(offset, record)
+            elif isinstance(record, Attachment) and (name := WEIGHTS_NAME.fullmatch(record.name)):
+                if len(record.data) > MAX_WEIGHTS_BYTES or len(self.weights) >= MAX_VERSIONS:
+                    raise StateError(f"{path}: {record.name}: too large, or too many versions")
+                self.weights[int(name[1])] = offset
             self.complete = isinstance(record, Footer)
         self.origin = self._origin(about)
 
@@ -194,14 +193,6 @@ class Recording:
             raise StateError(f"{self._path}: cannot be read: {error.strerror}") from error
         except (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError) as error:
             raise StateError(f"{self._path}: damaged: {error or type(error).__name__}") from error
-
-    def _note_weights(self, offset: int, attachment: Attachment) -> None:
-        number = attachment.name.removeprefix(WEIGHTS)
-        if attachment.name == number or not NUMBER.fullmatch(number):
-            return
-        if len(attachment.data) > MAX_WEIGHTS_BYTES or len(self.weights) >= MAX_VERSIONS:
-            raise StateError(f"{self._path}: {attachment.name}: too large, or too many versions")
-        self.weights[int(number)] = offset
 
     def _origin(self, about: dict[str, dict[str, str]]) -> Origin:
         try:

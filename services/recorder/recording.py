@@ -1,14 +1,4 @@
-"""The form of a recording: what an MCAP file holds of a run, and a writer of it.
-
-| in the file | what it is |
-|---|---|
-| channel, `msgpack` | one key of the protocol, bytes as they were on the wire |
-| channel, `protobuf` or `json` | what other tools show of them (`views.py`) |
-| schema | name of the message, its fields as JSON schema or as Protocol Buffers |
-| metadata `recording` | run, protocol, version of preprocessing, numerics of the actor |
-| metadata `config` | the configuration of the run as TOML, seed included |
-| attachment `weights/<version>` | the target network of that version as safetensors |
-| metadata `summary` | counts, once the recording came to a clean end |
+"""The form of a recording, an MCAP file, and a writer of it (docs/recording.md has a table of it).
 
 Chunks are compressed by zstd and end once a second, so that a kill costs no more than that.
 """

@@ -62,11 +62,7 @@ class Film:
 
 @contextmanager
 def filming(path: Path, frames_per_s: float) -> Iterator[Film]:
-    """A film in a new file, `.mp4` or `.gif`, which is complete after the block.
-
-    Raises:
-        ConfigError: Another ending, the file exists, or it cannot be written.
-    """
+    """A film in a new file, `.mp4` or `.gif`, complete after the block. Raises ConfigError."""
     if path.suffix not in (".mp4", ".gif"):
         raise ConfigError(f"{path}: expected a name that ends in .mp4 or .gif")
     if path.exists():
