@@ -32,7 +32,7 @@ OPSET, IR_VERSION = helper.make_opsetid("", 17), 8
 """Old enough for every runtime of the last years."""
 TOLERANCE = 1e-5
 """Predictions of the ONNX file may differ by this from ours."""
-CHECKED = 256
+CHECKED = 1000
 """Images that an export is checked with."""
 
 

@@ -6,6 +6,7 @@ A package names its additions in its own `pyproject.toml`, by group and name (do
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import entry_points
 from typing import Any
 
@@ -22,6 +23,7 @@ def names(group: str) -> list[str]:
     return sorted(entry_points(group=group).names)
 
 
+@cache
 def load(group: str, name: str) -> Any:
     """What a package added under this name. Raises KeyError: nothing."""
     found = entry_points(group=group, name=name)

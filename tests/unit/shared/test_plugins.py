@@ -70,6 +70,7 @@ def installed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
             ("trackers", "log", "track"),
         )
     ]
+    plugins.load.cache_clear()
     monkeypatch.setattr(
         plugins, "entry_points", lambda **chosen: EntryPoints(added).select(**chosen)
     )
