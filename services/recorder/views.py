@@ -20,7 +20,7 @@ from shared.messages import Action, Box, Message, Observation
 Solids = Callable[[str], Sequence[Box]]
 """Walls and boxes of a world, by its name."""
 WORLD = "world"
-_NUMBERS = dict.fromkeys((*SHORT_NAMES, "action", "greedy", "weights_version", "episode"))
+_NUMBERS = dict.fromkeys((*SHORT_NAMES, "action", "weights_version", "episode"))
 _FIELDS = {"type": "object", "properties": {name: {"type": "number"} for name in _NUMBERS}}
 PREDICTION = Schema(
     name="corridor.Prediction", encoding="jsonschema", data=json.dumps(_FIELDS).encode()
