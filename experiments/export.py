@@ -1,7 +1,5 @@
 """What a run leaves behind, for other programs: its network as ONNX, its memory as Parquet ..."""
 
-from __future__ import annotations
-
 import io
 import json
 import math
@@ -24,7 +22,7 @@ from services.replay.tables import Tables
 from shared.errors import ConfigError, StateError
 from shared.facts import ACTIONS, IMAGE_SHAPE
 from shared.provenance import BUNDLE
-from shared.rl.memory import Images, ReplayMemory
+from shared.rl.memory import PART, Images, ReplayMemory
 from shared.rl.network import HIDDEN, QNetwork, load_bytes
 from shared.run_record import read_episodes
 
@@ -62,14 +60,16 @@ def memory(run: Path, out: Path) -> str:
     samples, tables = ReplayMemory(1), Tables(run / "replay", readonly=True)
     with closing(tables.env):
         tables.update(samples)
-    names = [name for name in samples.rows.dtype.names or () if name != "slot"]
-    parts = (_table(samples, names, *part) for part in samples.parts(np.arange(len(samples))))
-    first = next(parts, None)
-    if first is None:
+    if not len(samples):
         raise StateError(f"{run}: the replay memory is empty")
-    with parquet.ParquetWriter(out, first.schema, compression="zstd") as writer:
-        for table in (first, *parts):
-            writer.write_table(table)
+    names = [name for name in samples.rows.dtype.names or () if name != "slot"]
+    columns = {name: _column(samples.rows[name]) for name in names}
+    columns["world"] = pa.array([samples.worlds[i] for i in samples.rows["world"]])
+    parts = (images for _, images in samples.parts(np.arange(len(samples))))
+    columns["image"] = pa.array([_png(i) for part in parts for i in part], pa.large_binary())
+    actions = json.dumps([action.name for action in ACTIONS])
+    table = pa.table(columns).replace_schema_metadata({"actions": actions})
+    parquet.write_table(table, out, row_group_size=PART, compression="zstd")
     return f"{len(samples)} samples of {', '.join(samples.worlds)}"
 
 
@@ -93,18 +93,6 @@ def write(what: str, run: Path, out: Path) -> str:
     if out.exists():
         raise ConfigError(f"--out: {out} exists already")
     return f"{out}: {EXPORTS[what](run, out)}"
-
-
-def _table(
-    samples: ReplayMemory, names: list[str], ranks: npt.NDArray[np.int64], images: Images
-) -> pa.Table:
-    """Some samples, all columns."""
-    rows = samples.rows[ranks]
-    columns = {name: _column(rows[name]) for name in names}
-    columns["world"] = pa.array([samples.worlds[i] for i in rows["world"]])
-    columns["image"] = pa.array([_png(image) for image in images], pa.binary())
-    actions = json.dumps([action.name for action in ACTIONS])
-    return pa.table(columns).replace_schema_metadata({"actions": actions})
 
 
 def _column(values: npt.NDArray[Any]) -> pa.Array:

@@ -3,8 +3,6 @@
 A package names its additions in its own `pyproject.toml`, by group and name (docs/extending.md).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points

@@ -1,7 +1,5 @@
 """`corridor video`: a film of a recording, or of a drive with the frozen network of a run."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -38,9 +36,8 @@ def _film_recording(source: Path, out: Path, frames: int, parts: int, speed: flo
     robot = next((action.robot for _, action in recording.turns()), "")
 
     def turns() -> Iterator[tuple[Observation, Action]]:
-        for seen, action in recording.turns():
-            if seen is not None and action.robot == robot:
-                yield seen, action
+        mine = (turn for turn in recording.turns() if turn[1].robot == robot)
+        return ((seen, action) for seen, action in mine if seen is not None)
 
     total = sum(1 for _ in turns())
     each = min(frames // parts, total // parts)
@@ -49,8 +46,6 @@ def _film_recording(source: Path, out: Path, frames: int, parts: int, speed: flo
     begins = [round(part * (total - each) / max(parts - 1, 1)) for part in range(parts)]
     with filming(out, speed / recording.origin.config.robot.period_s) as film:
         for number, (seen, action) in enumerate(turns()):
-            if number in begins:
-                film.cut()
             if any(begin <= number < begin + each for begin in begins):
                 when = "filling" if action.filling else f"episode {action.episode}"
                 film.add(seen, action.values, action.action, f"action {number + 1:,}  {when}")

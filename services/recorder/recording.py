@@ -16,7 +16,7 @@ from foxglove import Schema
 from mcap.writer import Writer
 
 from services.recorder.tap import Heard, Version
-from services.recorder.views import Solids, View, Views, no_solids
+from services.recorder.views import Solids, View, Views
 from shared.codec import decode
 from shared.config import Config, Numerics
 from shared.errors import BadMessage, ConfigError
@@ -59,7 +59,7 @@ class RecordingWriter:
         ConfigError: The file exists or cannot be made.
     """
 
-    def __init__(self, path: Path, origin: Origin, solids: Solids = no_solids) -> None:
+    def __init__(self, path: Path, origin: Origin, solids: Solids = lambda _: ()) -> None:
         self.messages = self.refused = 0
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}

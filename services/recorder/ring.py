@@ -1,7 +1,5 @@
 """The last seconds of a run in memory, so that they can be written after something happened."""
 
-from __future__ import annotations
-
 from collections import deque
 
 from services.recorder.recording import RecordingWriter

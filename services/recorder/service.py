@@ -19,7 +19,7 @@ from pathlib import Path
 from services.recorder.recording import RECORDED, Origin, RecordingWriter
 from services.recorder.ring import Ring
 from services.recorder.tap import Tap, Version
-from services.recorder.views import Solids, no_solids
+from services.recorder.views import Solids
 from shared.config import Config, Numerics
 from shared.errors import ConfigError, StateError
 from shared.numerics import known
@@ -34,15 +34,15 @@ MIB = 1024 * 1024
 
 @dataclass(frozen=True)
 class Order:
-    """What is to be recorded, and where to."""
+    """Where to record, the largest file, and what stands in worlds.
+
+    last_s: If above 0, so many seconds are kept, and written when told to.
+    """
 
     path: Path
     limit_mib: int
-    """Largest file."""
     last_s: float = 0.0
-    """If above 0: keep so many seconds, and write them when told to."""
-    solids: Solids = no_solids
-    """What stands in a world."""
+    solids: Solids = lambda _: ()
 
 
 def run(config: Config, folder: Path, order: Order, echo: Callable[[str], None]) -> int:

@@ -4,8 +4,6 @@ A recording has them beside the messages of the protocol from which they are mad
 read them. An image is the same bytes in both, so that compression stores it once.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -25,11 +23,6 @@ _FIELDS = {"type": "object", "properties": {name: {"type": "number"} for name in
 PREDICTION = Schema(
     name="corridor.Prediction", encoding="jsonschema", data=json.dumps(_FIELDS).encode()
 )
-
-
-def no_solids(_: str) -> Sequence[Box]:
-    """Around a robot whose world nobody knows."""
-    return ()
 
 
 class View(NamedTuple):

@@ -1,7 +1,5 @@
 """A film of a drive: the network's image, its predictions, and the robot's way on the map."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -31,14 +29,9 @@ class Film:
     """Frames that are added one by one."""
 
     def __init__(self) -> None:
-        self.frames = 0
         self._mp4: cv2.VideoWriter | None = None
         self._gif: list[Image.Image] = []
         self._map = _Map("")
-
-    def cut(self) -> None:
-        """What comes next is no continuation: the robot's way begins anew."""
-        self._map.way.clear()
 
     def add(
         self, seen: Observation, values: Sequence[float], action: int | None, told: str = ""
@@ -52,7 +45,6 @@ class Film:
         frame[EDGE_PX : EDGE_PX + size[1], 30 : 30 + size[0]] = grey[:, :, np.newaxis]
         _draw_bars(frame, EDGE_PX + size[1] + 36, values, action, told)
         frame[:, SIDE_PX:] = self._map.draw(seen)
-        self.frames += 1
         if self._mp4 is not None:
             self._mp4.write(np.ascontiguousarray(frame[:, :, ::-1]))
         elif len(self._gif) < MAX_GIF_FRAMES:

@@ -301,14 +301,11 @@ def solids(name: str) -> list[Box]:
     found = [Box.model_validate(obstacle.model_dump()) for obstacle in world.obstacles]
     for wall in world.walls:
         for i, (ax, ay, bx, by) in enumerate(wall.segments.tolist()):
-            heading_deg, length_m = math.degrees(math.atan2(by - ay, bx - ax)), wall.lengths[i]
-            found.append(
-                Box(
-                    name=f"{wall.name}-{i}", x_m=(ax + bx) / 2, y_m=(ay + by) / 2,
-                    heading_deg=heading_deg, length_m=float(length_m), width_m=0.02,
-                    height_m=world.height_m, rgb=world.textures[wall.texture_of(i)].rgb,
-                )
-            )  # fmt: skip
+            side = {"x_m": (ax + bx) / 2, "y_m": (ay + by) / 2, "width_m": 0.02}
+            side |= {"heading_deg": math.degrees(math.atan2(by - ay, bx - ax))}
+            side |= {"length_m": float(wall.lengths[i]), "height_m": world.height_m}
+            rgb = world.textures[wall.texture_of(i)].rgb
+            found.append(Box.model_validate({"name": f"{wall.name}-{i}", "rgb": rgb, **side}))
     return found
 
 
