@@ -19,7 +19,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 BESIDE := -n 4 --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-full check lint unit system mutants compose-test extras-test page-test docs bench profile bench-full bench-peers clean
+.PHONY: help setup demo test test-full check lint unit system mutants compose-test extras-test page-test docs bench profile bench-full bench-peers peers-test clean
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
 
@@ -76,6 +76,9 @@ bench-full: $(VENV)/.dev ## the same with all images and rounds, in hours at mos
 
 bench-peers: $(PEERS)/.peers ## measure what other projects offer beside ours; installs them apart
 	$(PEERS)/bin/python -m benchmarks.run_all $(ARGS) peer_learning peer_replay peer_transport
+
+peers-test: $(PEERS)/.peers ## do others' learners train on the environments? installs them apart
+	$(PEERS)/bin/python -m tests.peers.trial
 
 clean: ## remove the virtual environments and all caches; runs stay
 	rm -rf $(VENV) $(PEERS) build *.egg-info .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -1,47 +1,32 @@
 """A baseline: DQN of Stable-Baselines3 learns in the same corridor, evaluated as ours is (E34).
 
-Equal to a plan of ours are the environment, the convolutions with their first weights, memory,
-mini-batch, constant exploration, the random actions before learning, and the number of actions.
-Different are what makes it DQN: one output per action instead of actions as an input, a discount
-factor and bootstrapped values, and its optimiser and update frequencies, which are
-Stable-Baselines3's defaults except for the target network, copied every 1,000 actions because runs
-are short.
-
-Reward `progress` is the environment's own: how far the action led, -1 at a bump. It does not tell
-driving from circling. Reward `distance` comes nearer to ours: how far the robot is from where it
-was 50 actions ago, of the farthest possible.
-
-    python -m benchmarks.dqn --like plus-rmm --actions 50000 --seed 1 --out DIR
-
-needs Stable-Baselines3 (`make bench-peers` installs it into `.venv-peers`).
+docs/evaluation.md tells what is equal to a plan of ours and what is not. It needs
+Stable-Baselines3, which `make bench-peers` installs into `.venv-peers`.
 """
 
 from __future__ import annotations
 
 import importlib.util
-import math
 import time
-from collections import deque
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import gymnasium
-import numpy as np
+import torch
 import typer
 from gymnasium.wrappers import TimeLimit
 
 from experiments.drives.choosers import Chooser
 from experiments.drives.frozen_drives import evaluate
-from experiments.environment import CorridorEnv, Image
+from experiments.environment import REWARDS, CorridorEnv
 from experiments.plans.plan import Plan, stage_config
 from experiments.plans.scales import divisor_of, load_plan
 from experiments.records import EVALUATION_COLUMNS
-from shared.config import Config
+from shared.config import Config, LearnerNumerics, NumericsConfig, RunConfig
 from shared.errors import ConfigError
 from shared.run_record import RunInfo, StageInfo, append_csv, made_here, now_utc, write_csv
 from shared.statefile import write_atomically
 
-NAMES = {"progress": "dqn-progress", "distance": "dqn-distance"}
+NAMES = {reward: f"dqn-{reward}" for reward in REWARDS}
 """Name of the experiment, by its reward."""
 STAGE = "learn"
 TARGET_EVERY = 1000
@@ -51,49 +36,15 @@ EVALUATIONS = 10
 EXIT_USAGE = 2
 
 
-class DistanceReward(gymnasium.Wrapper[Image, np.int64, Image, np.int64]):
-    """Rewards distance from where the robot was some actions ago; -1 at a bump stays.
-
-    Until there are so many actions in an episode its first place counts.
-    """
-
-    def __init__(self, env: gymnasium.Env[Image, np.int64], config: Config) -> None:
-        super().__init__(env)
-        self._max_distance_m = config.max_distance_m
-        self._places: deque[tuple[float, float]] = deque(maxlen=config.episode.horizon + 1)
-
-    def reset(self, **given: Any) -> tuple[Image, dict[str, Any]]:
-        """Begin an episode."""
-        image, info = self.env.reset(**given)
-        self._places.clear()
-        self._remember(info)
-        return image, info
-
-    def step(self, action: np.int64) -> tuple[Image, float, bool, bool, dict[str, Any]]:
-        """Drive one action."""
-        image, reward, terminated, truncated, info = self.env.step(action)
-        if not terminated:
-            self._remember(info)
-            reward = math.dist(self._places[0], self._places[-1]) / self._max_distance_m
-        return image, float(reward), terminated, truncated, info
-
-    def _remember(self, info: dict[str, Any]) -> None:
-        seen = info["observation"]
-        self._places.append((seen.x_m, seen.y_m))
-
-
 class Dqn:
     """DQN of Stable-Baselines3 as a learner; it has driven the random actions already."""
 
     def __init__(self, config: Config, reward: str) -> None:
         from benchmarks import sb3
 
-        self._sb3 = sb3
-        sb3.use_threads(config.numerics.learner.threads)
-        env: gymnasium.Env[Image, np.int64] = CorridorEnv(config=config)
-        if reward == "distance":
-            env = DistanceReward(env, config)
+        torch.set_num_threads(config.numerics.learner.threads)
         self._random = config.memory.capacity
+        env = CorridorEnv(config=config, reward=reward)
         self._model = sb3.dqn(
             TimeLimit(env, config.episode.max_samples), config,
             random_steps=self._random, target_update_interval=TARGET_EVERY,
@@ -114,7 +65,7 @@ class Dqn:
     @property
     def train_steps(self) -> int:
         """Mini-batches trained so far."""
-        return self._sb3.mini_batches(self._model)
+        return int(self._model._n_updates)
 
 
 def run(config: Config, info: RunInfo, learner: Dqn, drives: tuple[int, int], out: Path) -> None:
@@ -161,18 +112,10 @@ def shared_config(like: Plan, seed: int, reward: str, threads: int) -> Config:
     """What the baseline has in common with the last stage of a plan. Raises ConfigError."""
     if reward not in NAMES:
         raise ConfigError(f"--reward: expected one of {', '.join(NAMES)}, got {reward!r}")
+    run, learner = RunConfig(name=NAMES[reward], seed=seed), LearnerNumerics(threads=threads)
+    numerics = NumericsConfig(learner=learner)
     ours = stage_config(like, len(like.stages) - 1, seed)
-    return Config.model_validate(
-        {
-            "run": {"name": NAMES[reward], "seed": seed},
-            "robot": ours.robot.model_dump(),
-            "episode": ours.episode.model_dump(),
-            "policy": {"kind": "eps-greedy", "epsilon": ours.policy.epsilon},
-            "network": ours.network.model_dump(),
-            "memory": {"capacity": ours.memory.capacity, "strategy": "normm"},
-            "numerics": {"learner": {"threads": threads}},
-        }
-    )
+    return ours.model_copy(update={"run": run, "numerics": numerics})
 
 
 app = typer.Typer(add_completion=False)

@@ -33,12 +33,12 @@ class Baseline:
     @property
     def mini_batches(self) -> int:
         """Mini-batches trained so far."""
-        return sb3.mini_batches(self.model)
+        return int(self.model._n_updates)
 
     @property
     def parameters(self) -> int:
         """Trained parameters of its network."""
-        return sb3.parameters(self.model)
+        return sum(p.numel() for p in self.model.q_net.parameters())
 
     def close(self) -> None:
         """Free the simulation."""

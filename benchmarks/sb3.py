@@ -10,7 +10,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import torch
 from stable_baselines3 import DQN
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor
@@ -68,18 +67,3 @@ def greedy(model: DQN) -> Chooser:
         return [int(model.predict(image, deterministic=True)[0]) for image in images]
 
     return chosen
-
-
-def mini_batches(model: DQN) -> int:
-    """Mini-batches trained so far."""
-    return int(model._n_updates)
-
-
-def parameters(model: DQN) -> int:
-    """Trained parameters of its network."""
-    return sum(p.numel() for p in model.q_net.parameters())
-
-
-def use_threads(count: int) -> None:
-    """PyTorch's, in this process."""
-    torch.set_num_threads(count)

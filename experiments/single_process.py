@@ -77,7 +77,8 @@ class SingleProcess:
 
     def run(self) -> Iterator[TurnDone]:
         """Drive and learn for ever; yields after every submission, fill ones included."""
-        observation: Observation = self.env.reset()[1]["observation"]
+        self.env.reset()
+        observation = self.env.seen
         self.actor.begin(self._progress(), observation)
         while True:
             submission = self.actor.finish(observation)
@@ -95,11 +96,9 @@ class SingleProcess:
 
     def _drive(self, action: int) -> Observation:
         """Drive one action and look, after a bump from where the driver recovered to (E11)."""
-        _, _, bumped, _, info = self.env.step(np.int64(action))
-        if bumped:
-            _, info = self.env.reset()
-        observation: Observation = info["observation"]
-        return observation
+        if self.env.step(np.int64(action))[2]:
+            self.env.reset()
+        return self.env.seen
 
     def _progress(self) -> RobotProgress:
         return numbering.progress_of(self.counters, self.config.memory, self.config.robot.id)

@@ -12,18 +12,21 @@ import hashlib
 import json
 import math
 import re
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from shared.facts import DEFAULT_ENDPOINT, DEFAULT_RUN, IMAGE_HEIGHT, IMAGE_WIDTH, NAME
+from shared.plugins import POLICIES, RETENTION, ROBOTS, OneOf
 from shared.rl.retention.table import STRATEGIES
 
-if TYPE_CHECKING:
-    StrategyName = str
-else:  # a type checker cannot read the table
-    StrategyName = Literal[tuple(STRATEGIES)]
+RobotKind = Annotated[str, AfterValidator(OneOf(ROBOTS, ("sim", "robotino", "ros2")))]
+PolicyKind = Annotated[
+    str, AfterValidator(OneOf(POLICIES, ("eps-greedy", "roulette", "eps-greedy-roulette")))
+]
+StrategyName = Annotated[str, AfterValidator(OneOf(RETENTION, tuple(STRATEGIES)))]
+"""Other packages may add to these by entry points."""
 
 Name = Annotated[str, Field(pattern=NAME.pattern)]
 """A run, robot or world name: it becomes part of a Zenoh key, so no '/', '*', '$' or spaces."""
@@ -196,7 +199,7 @@ class RobotConfig(Section):
     """The robot, its motion, and the limits its driver enforces whatever the network says."""
 
     id: Name = "robotino1"
-    kind: Literal["sim", "robotino", "ros2"] = "sim"
+    kind: RobotKind = "sim"
     """The PyBullet simulation, or a real robot, which a section below says how to reach."""
     timing: Literal["lockstep", "realtime"] = "lockstep"
     """lockstep: simulated time waits for each action; realtime: the period is fixed."""
@@ -283,7 +286,7 @@ class RewardConfig(Section):
 class PolicyConfig(Section):
     """How actions are chosen (A18-A20)."""
 
-    kind: Literal["eps-greedy", "roulette", "eps-greedy-roulette"] = "eps-greedy-roulette"
+    kind: PolicyKind = "eps-greedy-roulette"
     epsilon: Probability = 0.1
     """Probability of a choice by chance or roulette (E3)."""
     temperature: float = Field(default=0.01, gt=0.0, le=100.0)
@@ -472,7 +475,8 @@ class Config(Section):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         filters, name = self.network.filters, self.memory.strategy
-        of_maps = STRATEGIES[name].describes and self.memory.descriptor in ("maps", "first-maps")
+        ours = STRATEGIES.get(name)
+        of_maps = ours and ours.describes and self.memory.descriptor in ("maps", "first-maps")
         if of_maps and filters % 16 and 16 % filters:
             raise ValueError(
                 f"memory.strategy '{name}' needs network.filters to divide 16 or to be a multiple "

@@ -1,4 +1,4 @@
-"""What a run or a measurement was made with: commit, processor, versions."""
+"""What a run, a network or a measurement was made with: commit, processor, versions, robot."""
 
 from __future__ import annotations
 
@@ -10,14 +10,41 @@ import shutil
 import subprocess
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from shared.config import Config
+from pydantic import BaseModel, ConfigDict, Field
 
+from shared.config import Config, NetworkConfig, RobotConfig
+from shared.facts import ACTIONS, IMAGE_SHAPE
+from shared.rl.preprocess import PREPROCESS_VERSION
+
+BUNDLE, BUNDLE_FORMAT = "bundle", 1
+"""Where the metadata of a file of weights have its `Bundle` as JSON."""
 ROOT = Path(__file__).parents[1]
 RECORDED = (":!docs", ":!benchmarks/results.json", ":!benchmarks/results.md")
 """Text, and what measuring writes: no change to what is measured."""
+
+
+class Bundle(BaseModel):
+    """What a network was trained for and by what. Every file of weights or checkpoint has it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    format: int = BUNDLE_FORMAT
+    preprocessing: int = PREPROCESS_VERSION
+    """Of its pictures."""
+    image: tuple[int, int] = Field(default=IMAGE_SHAPE, description="Height and width in pixels.")
+    actions: tuple[str, ...] = tuple(action.name for action in ACTIONS)
+    network: NetworkConfig
+    robot: RobotConfig
+    """The robot that it learnt on: what an action does, and what the camera sees."""
+    provenance: dict[str, str | int | None]
+
+
+def bundle(config: Config, **counts: int | None) -> Bundle:
+    """What a network of this run is. counts: how far it has learnt."""
+    run: dict[str, str | int | None] = {"run": config.run.name, "world": config.robot.world}
+    provenance = {**run, "seed": config.run.seed, **counts}
+    return Bundle(network=config.network, robot=config.robot, provenance=provenance)
 
 
 def machine() -> dict[str, str]:

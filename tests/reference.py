@@ -137,7 +137,12 @@ def _type(field: FieldInfo) -> str:
             value = getattr(item, name, None)
             if value is not None:
                 limits[name] = value
-    words = [_name(field.annotation)]
+    ours = [
+        item.func.ours
+        for item in field.metadata
+        if hasattr(item, "func") and hasattr(item.func, "ours")
+    ]
+    words = [" or ".join(f'"{name}"' for name in ours[0]) if ours else _name(field.annotation)]
     if "pattern" in limits:
         words.append(f"`{limits.pop('pattern')}`")
     least, most = limits.pop("min_length", None), limits.pop("max_length", None)

@@ -88,8 +88,8 @@ class Drive:
     def __init__(self, env: CorridorEnv, number: int, pose: Pose) -> None:
         """Stand the robot there; `number` seeds its recoveries."""
         self._env = env
-        info = env.reset(seed=number, options={"pose": pose})[1]
-        self.observation: Observation = info["observation"]
+        env.reset(seed=number, options={"pose": pose})
+        self.observation: Observation = env.seen
         """What the next action is chosen by."""
         self._poses = [(pose.x_m, pose.y_m, pose.heading_rad)]
         self.bumps: list[bool] = []
@@ -98,12 +98,12 @@ class Drive:
 
     def act(self, action: int) -> bool:
         """Carry out an action, recovery included; whether it bumped."""
-        _, _, bumped, _, info = self._env.step(np.int64(action))
+        bumped = self._env.step(np.int64(action))[2]
         reached, (x_m, y_m, _) = self._env.robot.pose, self._poses[-1]
         way_m = math.hypot(reached.x_m - x_m, reached.y_m - y_m)
         if bumped:
-            _, info = self._env.reset()
-        self._note(info["observation"], bumped, way_m)
+            self._env.reset()
+        self._note(self._env.seen, bumped, way_m)
         return bumped
 
     def turn(self, *, left: bool) -> None:

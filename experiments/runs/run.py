@@ -22,12 +22,13 @@ from experiments.runs.episode_row import episode_row, held, memory_hash
 from experiments.runs.observer import EVALUATIONS, Observer
 from experiments.runs.totals import Progress, Totals, Watch
 from experiments.single_process import SingleProcess, TurnDone
+from services.commander.frozen import packed
 from services.robot_driver.simulated.sim import SimRobot
 from services.robot_driver.simulated.world import load_world
 from shared.config import Config
 from shared.errors import StateError
 from shared.numerics import Role, settle
-from shared.provenance import machine_key
+from shared.provenance import bundle, machine_key
 from shared.rl.network import to_bytes
 from shared.run_record import (
     EPISODE_COLUMNS,
@@ -182,9 +183,12 @@ class Run:
         return False
 
     def _finish(self) -> None:
-        data = to_bytes(self._loop.trainer.target_network)
-        write_atomically(self.folder / "weights.safetensors", data)
-        write_atomically(self.folder / "best.safetensors", self._best)
+        trainer, config = self._loop.trainer, self._loop.config
+        last = bundle(config, episode=self._loop.counters.episode, train_steps=trainer.train_steps)
+        files = {"weights": (to_bytes(trainer.target_network), last)}
+        files["best"] = self._best, bundle(config)
+        for name, (data, made) in files.items():
+            write_atomically(self.folder / f"{name}.safetensors", packed(data, made))
         if self.plan.tours:
             self._show()
             self._observer.drive_tours(self._world)

@@ -28,7 +28,8 @@ def save(folder: Path, loop: SingleProcess, extra: dict[str, Any]) -> None:
     """
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    checkpoint.write(folder / CHECKPOINT, loop.trainer, loop.counters.episode, _identity(loop))
+    path, episode = folder / CHECKPOINT, loop.counters.episode
+    checkpoint.write(path, loop.trainer, episode, _identity(loop), config=loop.config)
     memory = loop.memory
     with (folder / MEMORY).open("wb") as file:
         np.savez(

@@ -21,8 +21,8 @@ from services.cli.options import (
 from services.security.use import using
 
 if TYPE_CHECKING:
-    from services.commander.bundle import Bundle
     from shared.config import Config
+    from shared.provenance import Bundle
 
 DRIVING = ("pilot", "operator")
 """Credentials for driving: those of a pilot, who may send actions."""
@@ -50,6 +50,9 @@ def drive(
     ],
     robot: OneRobot = None,
     actions: Annotated[int, typer.Option(min=0, help="Stop after so many; 0: never.")] = 0,
+    video: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Film it: a new .mp4 or .gif.")
+    ] = None,
 ) -> None:
     """Let a frozen network drive a robot: nothing is learnt, nothing is stored.
 
@@ -69,7 +72,12 @@ def drive(
         file = sources.config or bundle.frozen.configuration_of(network)
         shape = made.network if made else Sources(None, file, sources.set_).load().network
         predictor = found.predictor(shape)
-        raise typer.Exit(command.run(there, predictor, found.path, robot, actions, typer.echo))
+        watch = None
+        if video:
+            film = import_installed("services.robot_driver.atlas.film", "sim")
+            watch = stack.enter_context(film.filming(video, 1.0 / there.robot.period_s)).add
+        code = command.run(there, predictor, found.path, robot, actions, typer.echo, watch)
+    raise typer.Exit(code)
 
 
 def _alone(
@@ -136,6 +144,12 @@ def record(
     limit_mib: Annotated[
         int, typer.Option(min=1, max=1_000_000, help="End when the file is as large.")
     ] = 4096,
+    last: Annotated[
+        float,
+        typer.Option(
+            min=0.0, max=3600.0, help="Keep so many seconds; write them at SIGUSR1 and at the end."
+        ),
+    ] = 0.0,
     config: ConfigOption = None,
 ) -> None:
     """Record what a run publishes and its weights as MCAP, until Ctrl-C.
@@ -148,10 +162,12 @@ def record(
     else:
         loaded = which.reach(*kinds)
     service = import_installed("services.recorder.service", "record")
+    from services.robot_driver.simulated.world import solids
     from shared.service import setup_logging
 
     setup_logging("recorder", None)
-    raise typer.Exit(service.run(loaded, which.folder(loaded), out, limit_mib, typer.echo))
+    order = service.Order(out, limit_mib, last, solids)
+    raise typer.Exit(service.run(loaded, which.folder(loaded), order, typer.echo))
 
 
 def playback(

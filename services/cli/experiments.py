@@ -10,7 +10,7 @@ from services.cli.options import ConfigOption, SetOption, Sources, import_instal
 
 def add_to(app: typer.Typer) -> None:
     """Add the commands."""
-    for command in (experiment, retention, report, evaluate):
+    for command in (experiment, retention, report, evaluate, export, video):
         app.command()(command)
 
 
@@ -117,3 +117,38 @@ def evaluate(
     folder = out or Path(f"evaluation-{loaded.robot.world}")
     command.run(run, loaded, starts, actions, folder)
     typer.echo(f"written to {folder}")
+
+
+def export(
+    what: Annotated[
+        str,
+        typer.Argument(
+            metavar="WHAT",
+            help="weights: the network as ONNX; memory: samples, metrics: episodes as Parquet.",
+        ),
+    ],
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")],
+    out: Annotated[Path, typer.Option(help="File to write, such as demo.onnx or demo.parquet.")],
+) -> None:
+    """Write what a run left behind in a form that other programs read."""
+    typer.echo(import_installed("experiments.export", "export").write(what, run, out))
+
+
+def video(
+    source: Annotated[
+        Path,
+        typer.Argument(metavar="RUN|RECORDING", help="Folder of a run, its weights, or an .mcap."),
+    ],
+    out: Annotated[Path, typer.Option(help="File to write, such as lap.mp4 or lap.gif.")],
+    world: Annotated[
+        str | None, typer.Option(help="Where a network drives; default: where it learnt.")
+    ] = None,
+    frames: Annotated[int, typer.Option(min=1, max=100_000, help="Most of them.")] = 400,
+    parts: Annotated[
+        int, typer.Option(min=1, max=100, help="Show so many parts of a recording, evenly spread.")
+    ] = 1,
+    speed: Annotated[float, typer.Option(min=0.1, max=100.0, help="Times faster than it was.")] = 4,
+) -> None:
+    """Film a recording, or a drive with the frozen network of a run: image, predictions, map."""
+    command = import_installed("experiments.drives.video_command", "experiments")
+    typer.echo(command.run(source, out, world, frames, parts, speed))

@@ -1,42 +1,22 @@
 """A trained network as one file that says what it needs: shape, pictures, actions, geometry.
 
-It is a safetensors file whose metadata hold a `Bundle` as JSON under `bundle`. Other programs read
-it as plain weights.
+It is a safetensors file whose metadata hold a `Bundle`. Other programs read it as plain weights.
 """
 
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ValidationError
 
 from services.commander import frozen
-from shared import run_record, settings
-from shared.config import Config, NetworkConfig, RobotConfig
+from shared import provenance, run_record, settings
+from shared.config import Config, RobotConfig
 from shared.errors import ConfigError, StateError, first_problem
-from shared.facts import ACTIONS, IMAGE_SHAPE
-from shared.rl.preprocess import PREPROCESS_VERSION
+from shared.provenance import BUNDLE, Bundle
 from shared.statefile import write_atomically
 
-FORMAT = 1
-KEY = "bundle"
 TOLERANCE = 0.1
 """A robot may go this much farther or less far with an action than where the network learnt."""
-
-
-class Bundle(BaseModel):
-    """What a network was trained for and by what."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    format: int
-    preprocessing: int
-    """`PREPROCESS_VERSION` of its pictures."""
-    image: tuple[int, int] = Field(description="Height and width in pixels.")
-    actions: tuple[str, ...]
-    network: NetworkConfig
-    robot: RobotConfig
-    """The robot that it learnt on: what an action does, and what the camera sees."""
-    provenance: dict[str, str | int | None]
 
 
 def make(run: Path, out: Path) -> Bundle:
@@ -48,23 +28,26 @@ def make(run: Path, out: Path) -> Bundle:
     """
     if out.exists():
         raise ConfigError(f"--out: {out} exists already")
-    found = frozen.read(frozen.find(run))
+    found, made = described(run)
+    found.predictor(made.network)  # it fits
+    write_atomically(out, frozen.packed(found.data, made))
+    return made
+
+
+def described(run: Path) -> tuple[frozen.Frozen, Bundle]:
+    """The network of a run, and what it says or its folder tells of it. Raises as `make`."""
+    found, made = look(run)
     file = frozen.configuration_of(run)
-    if file is None:
-        raise ConfigError(f"run {run}: expected a {settings.FILE_NAME} in it, found none")
-    config = settings.read_folder(file.parent)
-    found.predictor(config.network)  # it fits
-    bundle = Bundle(
-        format=FORMAT,
-        preprocessing=PREPROCESS_VERSION,
-        image=IMAGE_SHAPE,
-        actions=tuple(action.name for action in ACTIONS),
-        network=config.network,
-        robot=config.robot,
-        provenance=_provenance(file.parent, config, found),
-    )
-    write_atomically(out, found.packed({KEY: bundle.model_dump_json()}))
-    return bundle
+    if made is None:
+        if file is None:
+            raise ConfigError(f"run {run}: expected a {settings.FILE_NAME} in it, found none")
+        config = settings.read_folder(file.parent)
+        made = provenance.bundle(config, episode=found.episode, train_steps=found.train_steps)
+    if file is None or not (record := file.parent / run_record.RUN).exists():
+        return found, made
+    info = run_record.RunInfo.model_validate_json(record.read_bytes())
+    told = made.provenance | {"commit": info.commit, "started": info.started}
+    return found, made.model_copy(update={"provenance": told})
 
 
 def look(network: Path) -> tuple[frozen.Frozen, Bundle | None]:
@@ -81,19 +64,15 @@ def of(found: frozen.Frozen) -> Bundle | None:
             program.
         StateError: It cannot be read.
     """
-    text = found.metadata.get(KEY)
+    text = found.metadata.get(BUNDLE)
     if text is None:
         return None
     try:
         bundle = Bundle.model_validate_json(text)
     except ValidationError as error:
         raise StateError(f"{found.path}: damaged bundle: {first_problem(error)}") from error
-    for what, here in (
-        ("format", FORMAT),
-        ("preprocessing", PREPROCESS_VERSION),
-        ("image", IMAGE_SHAPE),
-        ("actions", tuple(action.name for action in ACTIONS)),
-    ):
+    for what in ("format", "preprocessing", "image", "actions"):
+        here = Bundle.model_fields[what].default
         there = getattr(bundle, what)
         if there != here:
             raise ConfigError(
@@ -133,18 +112,3 @@ def overrides(bundle: Bundle) -> list[str]:
 
 def _text(value: Any) -> str:
     return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
-
-
-def _provenance(folder: Path, config: Config, found: frozen.Frozen) -> dict[str, str | int | None]:
-    """Where it comes from, as far as the folder tells."""
-    told: dict[str, str | int | None] = {
-        "run": config.run.name,
-        "world": config.robot.world,
-        "seed": config.run.seed,
-        "episode": found.episode,
-        "train_steps": found.train_steps,
-    }
-    if (folder / run_record.RUN).exists():
-        info = run_record.RunInfo.model_validate_json((folder / run_record.RUN).read_bytes())
-        told |= {name: getattr(info, name) for name in ("commit", "started")}
-    return told

@@ -23,6 +23,7 @@ from shared.service import TICK_S
 
 ROLE = "drive"
 TELL_EVERY_S = 2.0
+Watch = Callable[[Observation, tuple[float, ...], int | None, str], None]
 SILENT_S = 10.0
 """A robot that has said nothing for so long is mentioned."""
 
@@ -107,6 +108,7 @@ def run(
     robot: str | None,
     actions: int,
     echo: Callable[[str], None],
+    watch: Watch | None = None,
 ) -> int:
     """Drive until stopped, or until the wanted number of actions is done.
 
@@ -117,6 +119,7 @@ def run(
         robot: Which robot; None: the only one there is.
         actions: 0: until stopped.
         echo: Shows a line.
+        watch: Gets each observation with the predictions, the action (None: a turn) and a text.
 
     Returns:
         The exit code.
@@ -129,7 +132,7 @@ def run(
         echo(f"{commander.robot}: driven by {source}; Ctrl-C stops it")
         policy, tally = FrozenPolicy(predictor, config, commander.robot), DriveTally()
         try:
-            _drive(commander, policy, tally, actions, echo)
+            _drive(commander, policy, tally, actions, echo, watch)
         finally:
             echo(f"{commander.robot}: {tally}")
     return 0
@@ -141,6 +144,7 @@ def _drive(
     tally: DriveTally,
     actions: int,
     echo: Callable[[str], None],
+    watch: Watch | None,
 ) -> None:
     now_s = time.monotonic()
     tell_s, silent_s = now_s, now_s + SILENT_S
@@ -163,6 +167,11 @@ def _drive(
         else:
             commander.answer(observation, action=choice.action, values=choice.values)
         tally.ask()
+        if watch:
+            chosen = None if choice.side else choice.action
+            watch(
+                observation, choice.values, chosen, f"{tally.actions} actions, {tally.bumps} bumps"
+            )
         if now_s >= tell_s:
             tell_s = now_s + TELL_EVERY_S
             echo(f"{choice}  {tally}")

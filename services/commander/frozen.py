@@ -10,6 +10,7 @@ from safetensors.torch import save as save_safetensors
 
 from shared.config import ActorNumerics, NetworkConfig, Numerics
 from shared.errors import ConfigError, StateError
+from shared.provenance import BUNDLE, Bundle
 from shared.rl.predictor import Predictor
 from shared.settings import FILE_NAME
 
@@ -31,10 +32,6 @@ class Frozen:
     metadata: dict[str, str] = field(default_factory=dict)
     """What else the file tells of itself, as text."""
 
-    def packed(self, metadata: dict[str, str]) -> bytes:
-        """A file of weights with these metadata."""
-        return save_safetensors(load_safetensors(self.data), metadata)
-
     def predictor(self, network: NetworkConfig, numerics: Numerics | None = None) -> Predictor:
         """The network ready to predict: one image at a time unless `numerics` tell otherwise.
 
@@ -48,6 +45,11 @@ class Frozen:
                 f"{self.path}: not a network with network.filters = {network.filters}: {error}"
             ) from error
         return predictor
+
+
+def packed(data: bytes, made: Bundle) -> bytes:
+    """Weights as a file that says what it is."""
+    return save_safetensors(load_safetensors(data), {BUNDLE: made.model_dump_json()})
 
 
 def find(run: Path) -> Path:
@@ -77,6 +79,8 @@ def read(path: Path) -> Frozen:
             counters = state.get("counters", {}) if isinstance(state, dict) else None
             if not isinstance(counters, dict):
                 raise ValueError("expected an object as its state")
+            if BUNDLE in state:
+                metadata[BUNDLE] = json.dumps(state[BUNDLE])
             names = list(file.keys())
             prefix = TARGET if any(name.startswith(TARGET) for name in names) else ""
             tensors = {

@@ -17,7 +17,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as save_safetensors
 
 from services.learner.history import Place
+from shared.config import Config
 from shared.errors import StateError
+from shared.provenance import BUNDLE, bundle
 from shared.rl.learning import Trainer
 from shared.statefile import needing_room, set_aside
 from shared.statefile import sync as sync_folder
@@ -32,19 +34,21 @@ class Damaged(StateError):
 
 
 def write(
-    path: Path, trainer: Trainer, episode: int, identity: str, lineage: str = Place.lineage
-) -> None:
+    path: Path, trainer: Trainer, episode: int, identity: str, lineage: str = Place.lineage,
+    config: Config | None = None,
+) -> None:  # fmt: skip
     """Write the state after `episode`: on disk when this returns. Raises like `keep`."""
-    _promote(path, keep(path, trainer, episode, identity, lineage))
+    _promote(path, keep(path, trainer, episode, identity, lineage, config))
 
 
 def keep(
-    path: Path, trainer: Trainer, episode: int, identity: str, lineage: str = Place.lineage
-) -> Path:
+    path: Path, trainer: Trainer, episode: int, identity: str, lineage: str = Place.lineage,
+    config: Config | None = None,
+) -> Path:  # fmt: skip
     """Write the state after `episode`, and return where: it survives a kill, not a power cut.
 
-    lineage: of the memory as of that episode. Raises FloatingPointError and writes nothing when a
-    number is not finite; raises DiskFull.
+    lineage: of the memory as of that episode; config: what others must know who use the network.
+    Raises FloatingPointError and writes nothing when a number is not finite; raises DiskFull.
     """
     header = {
         "schema": SCHEMA,
@@ -54,6 +58,9 @@ def keep(
         "counters": trainer.counters(),
         "boot": _boot(),
     }
+    if config is not None:
+        made = bundle(config, episode=episode, train_steps=trainer.train_steps)
+        header[BUNDLE] = made.model_dump(mode="json")
     tensors = {name: t.cpu().contiguous() for name, t in trainer.tensors().items()}
     if odd := _not_finite(tensors):
         raise FloatingPointError(f"{odd} is not finite")

@@ -32,6 +32,8 @@ TAKEOVER = 2
 may have one more than replay."""
 SYNC_S = 60.0
 """Power cut or crash of the machine cost the turns of this time; each fit is brought to disk."""
+PROBES = 16
+"""Images of the memory, from all of it, that TensorBoard shows after a fit."""
 LAST_TAKEOVER = 2**31
 """Above this it does not: that many versions were never made."""
 
@@ -59,7 +61,7 @@ class LearnerLoop:
         self._mirror = Mirror()
         self._weights = self._checked_weights()
         self._hash = weights_hash(self._weights)
-        self._metrics = MetricsLog(folder / TRAINING, TRAINING_COLUMNS)
+        self._metrics = MetricsLog(folder / TRAINING, TRAINING_COLUMNS, config)
         rows, newest = self._metrics.rows(), self._place.episode
         self._metrics.restart([row for row in rows if int(row["episode"]) <= newest])
         self._activity: Activity = "waiting"
@@ -153,6 +155,11 @@ class LearnerLoop:
         steps = self._trainer.train_steps - steps_before
         row = self._row(turn, steps, time.monotonic() - start_s)
         self._me.insist("write down a turn", lambda: self._metrics.write(row))
+        if row["fitting"]:
+            samples = self._mirror.samples
+            ranks = np.linspace(0, len(samples) - 1, PROBES).astype(np.int64)
+            network = self._trainer.train_network
+            self._metrics.show_network(turn.episode, network, samples.images(ranks))
         self._activity = "checkpoint"
         try:
             weights = self._checked_weights() if changed else self._weights
@@ -169,7 +176,7 @@ class LearnerLoop:
     def _keep(self, turn: Turn, fitted: bool) -> None:
         """Write a checkpoint, and now and then bring it to disk. Raises DiskFull."""
         place = (turn.episode, self._identity, turn.lineage)
-        checkpoint.keep(self._path, self._trainer, *place)
+        checkpoint.keep(self._path, self._trainer, *place, self._me.config)
         if fitted or time.monotonic() - self._synced_s >= SYNC_S:
             checkpoint.sync(self._path)
             self._synced_s = time.monotonic()

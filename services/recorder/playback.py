@@ -6,9 +6,10 @@ with the recorded seed and numerics; what comes out is compared with the recorde
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +23,7 @@ from shared.rl.decision import decide
 from shared.rl.predictor import Predictor
 from shared.rl.preprocess import PREPROCESS_VERSION, preprocess
 
-KEPT_OBSERVATIONS = 256
-"""Observations kept for all robots together. An action follows its observation closely."""
 KEPT_NETWORKS = 4
-Place = tuple[str, str, int, int]
 
 
 @dataclass
@@ -57,14 +55,10 @@ class Comparison:
 
 
 def run(path: Path, echo: Callable[[str], None]) -> int:
-    """Play a recording back, print the comparison.
+    """Play a recording back; 0 if all compared actions are equal, 1 if not, or if there are none.
 
-    Returns:
-        0 if all actions compared are equal, 1 if not, or if none could be compared.
-
-    Raises:
-        ConfigError: No such file, or made for another version or with an engine not installed here.
-        StateError: It is no recording, or damaged.
+    Raises ConfigError for no file, or one for another version or an engine that is not installed
+    here; StateError for a damaged one.
     """
     recording = Recording(path)
     if not recording.complete:
@@ -89,24 +83,15 @@ def compare(recording: Recording) -> Comparison:
     ):
         if there != here:
             raise ConfigError(f"the recording is of {what} {there}, this is {here}")
-    networks = _Networks(recording)
-    found = Comparison()
-    seen: OrderedDict[Place, Observation] = OrderedDict()
-    for message in recording.messages():
-        if isinstance(message, Observation):
-            place = (message.robot, message.life, message.sequence, message.attempt)
-            seen[place] = message
-            if len(seen) > KEPT_OBSERVATIONS:
-                seen.popitem(last=False)
-        elif isinstance(message, Action):
-            place = (message.robot, message.robot_life, message.sequence, message.attempt)
-            _compare(origin.config, networks, seen.get(place), message, found)
+    network, found = _networks(recording), Comparison()
+    for observation, action in recording.turns():
+        _compare(origin.config, network, observation, action, found)
     return found
 
 
 def _compare(
     config: Config,
-    networks: _Networks,
+    networks: Callable[[int], Predictor | None],
     observation: Observation | None,
     action: Action,
     found: Comparison,
@@ -120,7 +105,7 @@ def _compare(
     if observation is None:
         found.skipped["its observation is not in the recording"] += 1
         return
-    network = networks.of(action.weights_version)
+    network = networks(action.weights_version)
     if network is None:
         found.skipped["its version of the weights is not in the recording"] += 1
         return
@@ -154,33 +139,26 @@ def seen_again(image: ImageArray) -> ImageArray:
     return again
 
 
-class _Networks:
-    """The recorded networks, the newest few of them ready to predict."""
+def _networks(recording: Recording) -> Callable[[int], Predictor | None]:
+    """The recorded networks by version; None for one that is not there."""
+    origin = recording.origin
+    if origin.numerics.device == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("the recording's actor computed on a GPU, and there is none here")
+    try:
+        none = Predictor(origin.config.network, origin.numerics)
+    except (ImportError, ValueError) as error:
+        raise ConfigError(f"the recording's numerics.actor: {error}") from error
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
-        self._ready: OrderedDict[int, Predictor] = OrderedDict()
-        origin = recording.origin
-        if origin.numerics.device == "cuda" and not torch.cuda.is_available():
-            raise ConfigError("the recording's actor computed on a GPU, and there is none here")
-        try:
-            self._none = Predictor(origin.config.network, origin.numerics)
-        except (ImportError, ValueError) as error:
-            raise ConfigError(f"the recording's numerics.actor: {error}") from error
-
-    def of(self, version: int) -> Predictor | None:
-        """The network of a version; None where it was not recorded. Raises StateError."""
-        if version not in self._recording.weights:
+    @lru_cache(KEPT_NETWORKS)
+    def of(version: int) -> Predictor | None:
+        if version not in recording.weights:
             return None
-        if version not in self._ready:
-            data = self._recording.load(version)
-            try:
-                self._ready[version] = self._none.successor(version, data)
-            except ValueError as error:
-                raise StateError(f"recorded weights of version {version}: {error}") from error
-            if len(self._ready) > KEPT_NETWORKS:
-                self._ready.popitem(last=False)
-        return self._ready[version]
+        try:
+            return none.successor(version, recording.load(version))
+        except ValueError as error:
+            raise StateError(f"recorded weights of version {version}: {error}") from error
+
+    return of
 
 
 def _text(values: tuple[float, ...] | list[float]) -> str:

@@ -6,15 +6,17 @@ A recording whose writer was killed ends in the middle; what came before is read
 import json
 import re
 import struct
+from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BufferedReader, FileIO
 from pathlib import Path
 
+import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.exceptions import EndOfFile, InvalidMagic, McapError
 from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.stream_reader import StreamReader
 from pydantic import ValidationError
 
 from services.recorder.recording import (
@@ -36,9 +38,15 @@ from shared.keys import Stream, check_sender, ident_in
 
 MAX_RECORD_BYTES = 128 * 1024 * 1024
 """A longer record, of weights for instance, is refused."""
+MAX_CHUNK_BYTES = 16 * 1024 * 1024
+"""A chunk that is larger once it is decompressed is refused."""
 MAX_WEIGHTS_BYTES = 64 * 1024 * 1024
 MAX_VERSIONS = 1_000_000
 NUMBER = re.compile(r"[0-9]{1,18}")
+WEIGHTS_NAME = re.compile(rf"{WEIGHTS}([0-9]{{1,18}})")
+KEPT_OBSERVATIONS = 256
+"""Observations kept for all robots together. An action follows its observation closely."""
+Place = tuple[str, str, int, int]
 
 
 class _File(BufferedReader):
@@ -54,10 +62,34 @@ class _File(BufferedReader):
         return data
 
 
+class _Reader(StreamReader):
+    """The records of a file, those in chunks among them unless these are wanted whole."""
+
+    def __init__(self, file: _File, *, chunks: bool = False, skip_magic: bool = False) -> None:
+        super().__init__(
+            file, skip_magic, chunks, validate_crcs=True, record_size_limit=MAX_RECORD_BYTES
+        )
+        self._file, self.offset = file, 0
+        """Where the newest record begins."""
+
+    def _read_record(self, opcode: int, length: int) -> McapRecord | None:
+        self.offset = self._file.tell() - 9  # opcode and length
+        record = super()._read_record(opcode, length)
+        if isinstance(record, Chunk):
+            size = record.uncompressed_size
+            if record.compression == "zstd":
+                size = max(size, zstandard.frame_content_size(record.data))
+            elif record.compression:
+                raise McapError(f"compressed by {record.compression!r:.20}, expected zstd")
+            if size > MAX_CHUNK_BYTES:
+                raise McapError(f"a chunk of {size} bytes, at most {MAX_CHUNK_BYTES}")
+        return record
+
+
 class Recording:
     """A recording in a file; every pass over it begins anew.
 
-    Raises ConfigError: there is no such file; StateError: it is no recording of this project, or is
+    Raises ConfigError if there is none, StateError if it is no recording of this project, or is
     damaged at its beginning.
     """
 
@@ -72,43 +104,60 @@ class Recording:
         self.undecodable = 0
         """Messages that the newest pass of `messages` could not decode."""
         about: dict[str, dict[str, str]] = {}
-        for offset, record in self._records():
+        for offset, record in self._records(chunks=True):
             if isinstance(record, Metadata):
                 if record.name in (RECORDING, CONFIG):
                     about.setdefault(record.name, record.metadata)
                 elif record.name == SUMMARY:
                     numbers = {k: v for k, v in record.metadata.items() if NUMBER.fullmatch(v)}
                     self.summary = {name: int(text) for name, text in numbers.items()}
-            elif isinstance(record, Attachment):
-                self._note_weights(offset, record)
+            elif isinstance(record, Attachment) and (name := WEIGHTS_NAME.fullmatch(record.name)):
+                if len(record.data) > MAX_WEIGHTS_BYTES or len(self.weights) >= MAX_VERSIONS:
+                    raise StateError(f"{path}: {record.name}: too large, or too many versions")
+                self.weights[int(name[1])] = offset
             self.complete = isinstance(record, Footer)
         self.origin = self._origin(about)
 
     def messages(self) -> Iterator[m.Message]:
         """All messages in the order in which they were recorded.
 
-        What is no message of the protocol is counted and left out. Raises StateError.
+        Channels for other tools are left out. What else is no message of the protocol is counted.
+        Raises StateError.
         """
         self.undecodable = 0
         schemas: dict[int, Schema] = {}
         channels: dict[int, tuple[Stream, str] | None] = {}
-        for _, outer in self._records():
-            for record in self._in_chunk(outer) if isinstance(outer, Chunk) else [outer]:
-                if isinstance(record, Schema) and len(schemas) < MAX_CHANNELS:
-                    schemas[record.id] = record
-                elif isinstance(record, Channel) and len(channels) < MAX_CHANNELS:
-                    channels[record.id] = _stream(record, schemas)
-                elif isinstance(record, Message):
-                    message = _decoded(record, channels.get(record.channel_id))
-                    if message is not None:
-                        yield message
-                    self.undecodable += message is None
+        views: set[int] = set()
+        for _, record in self._records():
+            if isinstance(record, Schema) and len(schemas) < MAX_CHANNELS:
+                schemas[record.id] = record
+            elif isinstance(record, Channel) and record.message_encoding != ENCODING:
+                views.add(record.id)
+            elif isinstance(record, Channel):
+                channels[record.id] = _stream(record, schemas)
+            elif isinstance(record, Message) and record.channel_id not in views:
+                message = _decoded(record, channels.get(record.channel_id))
+                if message is not None:
+                    yield message
+                self.undecodable += message is None
+
+    def turns(self) -> Iterator[tuple[m.Observation | None, m.Action]]:
+        """All actions, each with the observation that it answers, if that is there."""
+        seen: OrderedDict[Place, m.Observation] = OrderedDict()
+        for message in self.messages():
+            if isinstance(message, m.Observation):
+                seen[(message.robot, message.life, message.sequence, message.attempt)] = message
+                if len(seen) > KEPT_OBSERVATIONS:
+                    seen.popitem(last=False)
+            elif isinstance(message, m.Action):
+                place = (message.robot, message.robot_life, message.sequence, message.attempt)
+                yield seen.get(place), message
 
     def load(self, version: int) -> bytes:
         """The safetensors bytes of a version, as they were written. Raises StateError."""
         with self._guarded(), _File(FileIO(self._path)) as file:
             file.seek(self.weights[version])
-            attachment = next(iter(_reader(file, skip_magic=True).records))
+            attachment = next(iter(_Reader(file, skip_magic=True).records))
             assert isinstance(attachment, Attachment)
             file.seek(-4, 1)
             told, again = file.read(4), RecordBuilder()
@@ -117,16 +166,15 @@ class Recording:
                 raise McapError(f"weights {version} do not match their checksum")
             return attachment.data
 
-    def _records(self) -> Iterator[tuple[int, McapRecord]]:
+    def _records(self, *, chunks: bool = False) -> Iterator[tuple[int, McapRecord]]:
         """Offset and content of the records up to where the file ends or breaks off."""
         with self._guarded(), _File(FileIO(self._path)) as file:
-            offset = 0
+            reader = _Reader(file, chunks=chunks)
             try:
-                for record in _reader(file).records:
-                    yield offset, record
+                for record in reader.records:
+                    yield reader.offset, record
                     if isinstance(record, Footer):
                         return
-                    offset = file.tell()
             except EndOfFile:
                 return
 
@@ -141,23 +189,8 @@ class Recording:
             raise StateError(f"{self._path}: not an MCAP file") from error
         except OSError as error:
             raise StateError(f"{self._path}: cannot be read: {error.strerror}") from error
-        except (McapError, struct.error, ValueError, OverflowError) as error:
+        except (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError) as error:
             raise StateError(f"{self._path}: damaged: {error or type(error).__name__}") from error
-
-    def _in_chunk(self, chunk: Chunk) -> list[McapRecord]:
-        """The records in a chunk. Raises StateError."""
-        with self._guarded():
-            if chunk.compression:
-                raise McapError(f"compressed by {chunk.compression!r:.20}: decompress it first")
-            return breakup_chunk(chunk, validate_crc=True)
-
-    def _note_weights(self, offset: int, attachment: Attachment) -> None:
-        number = attachment.name.removeprefix(WEIGHTS)
-        if attachment.name == number or not NUMBER.fullmatch(number):
-            return
-        if len(attachment.data) > MAX_WEIGHTS_BYTES or len(self.weights) >= MAX_VERSIONS:
-            raise StateError(f"{self._path}: {attachment.name}: too large, or too many versions")
-        self.weights[int(number)] = offset
 
     def _origin(self, about: dict[str, dict[str, str]]) -> Origin:
         try:
@@ -173,14 +206,10 @@ class Recording:
         return Origin(config, numerics, protocol, preprocessing)
 
 
-def _reader(file: _File, *, skip_magic: bool = False) -> StreamReader:
-    return StreamReader(file, skip_magic, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES)
-
-
 def _stream(channel: Channel, schemas: dict[int, Schema]) -> tuple[Stream, str] | None:
     """The stream a channel is of; None for anything but the protocol's."""
     schema = schemas.get(channel.schema_id)
-    if schema is None or channel.message_encoding != ENCODING:
+    if schema is None:
         return None
     for stream in RECORDED:
         ident = ident_in(stream, channel.topic)

@@ -1,35 +1,31 @@
-"""The form of a recording: what an MCAP file holds of a run, and a writer of it.
+"""The form of a recording, an MCAP file, and a writer of it (docs/recording.md has a table of it).
 
-| in the file | what it is |
-|---|---|
-| channel | one key of the protocol; encoding `msgpack`, bytes as they were on the wire |
-| schema | name of the message, its fields as JSON schema |
-| metadata `recording` | run, protocol, version of preprocessing, numerics of the actor |
-| metadata `config` | the configuration of the run as TOML, seed included |
-| attachment `weights/<version>` | the target network of that version as safetensors |
-| metadata `summary` | counts, once the recording came to a clean end |
-
-Chunks are not compressed, so that a reader can bound what it takes into memory before it does.
+Chunks are compressed by zstd and end once a second, so that a kill costs no more than that.
 """
 
 import json
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import BinaryIO, Self
 
-from mcap.writer import CompressionType, Writer
+from foxglove import Schema
+from mcap.writer import Writer
 
-from services.recorder.tap import Heard
+from services.recorder.tap import Heard, Version
+from services.recorder.views import Solids, View, Views
+from shared.codec import decode
 from shared.config import Config, Numerics
-from shared.errors import ConfigError
-from shared.keys import STREAMS, Stream
+from shared.errors import BadMessage, ConfigError
+from shared.keys import ACTION, OBSERVATION, STREAMS, Stream
 from shared.messages import PROTOCOL_VERSION
 from shared.rl.preprocess import PREPROCESS_VERSION
 from shared.settings import to_toml
 
 PROFILE, ENCODING, SCHEMA_ENCODING = "corridor", "msgpack", "jsonschema"
 RECORDING, CONFIG, SUMMARY, WEIGHTS = "recording", "config", "summary", "weights/"
-CHUNK_BYTES = 256 * 1024
+CHUNK_BYTES = 1024 * 1024
 MAX_CHANNELS = 512
 """Keys of one recording; messages of more are refused and counted."""
 RECORDED: tuple[Stream, ...] = tuple(s for s in STREAMS if s.delivery == "latest")
@@ -55,18 +51,20 @@ class RecordingWriter:
     Args:
         path: New file.
         origin: Which run.
+        solids: What stands in its worlds.
 
     Raises:
         ConfigError: The file exists or cannot be made.
     """
 
-    def __init__(self, path: Path, origin: Origin) -> None:
+    def __init__(self, path: Path, origin: Origin, solids: Solids = lambda _: ()) -> None:
         self.messages = self.refused = 0
-        self._channels: dict[tuple[str, str], int] = {}
+        self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
+        self._views = Views(solids)
         self._run = origin.config.run.name
         self._file = _create(path)
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)
         self._writer.start(PROFILE)
         about = {
             "run": self._run,
@@ -93,21 +91,22 @@ class RecordingWriter:
         """Bytes so far."""
         return self._file.tell()
 
-    def add(self, heard: Heard) -> None:
-        """Write a message."""
-        channel = self._channel(heard.stream, heard.ident)
-        if channel is None:
+    def add(self, new: Heard | Version) -> None:
+        """Write a version of the target network, or a message and what other tools show of it."""
+        if isinstance(new, Version):
+            name, media_type = f"{WEIGHTS}{new.number}", "application/octet-stream"
+            self._writer.add_attachment(new.time_ns, new.time_ns, name, media_type, new.data)
+            return
+        stream = new.stream
+        raw = View(stream.key(self._run, new.ident), _schema(stream), new.data, ENCODING)
+        if not self._write(raw, new.time_ns):
             self.refused += 1
             return
-        self._writer.add_message(
-            channel, heard.time_ns, heard.data, heard.time_ns, sequence=self.messages % 2**32
-        )
         self.messages += 1
-
-    def add_weights(self, version: int, data: bytes, time_ns: int) -> None:
-        """Write a version of the target network, given as safetensors bytes."""
-        media_type = "application/octet-stream"
-        self._writer.add_attachment(time_ns, time_ns, f"{WEIGHTS}{version}", media_type, data)
+        if stream in (OBSERVATION, ACTION):
+            with suppress(BadMessage):  # playback counts it
+                for view in self._views.of(decode(new.data, stream.request), new.time_ns):
+                    self._write(view, new.time_ns)
 
     def add_summary(self, counts: dict[str, int]) -> None:
         """Write how much there is, and how much was lost."""
@@ -117,20 +116,30 @@ class RecordingWriter:
         """Hand everything so far to the operating system."""
         self._writer.flush()  # type: ignore[no-untyped-call]
 
-    def _channel(self, stream: Stream, ident: str) -> int | None:
-        place = (stream.name, ident)
-        if place not in self._channels:
+    def _write(self, view: View, time_ns: int) -> bool:
+        """Write a message of any channel; False: there are too many channels."""
+        name, topic = view.schema.name, view.topic
+        if topic not in self._channels:
             if len(self._channels) >= MAX_CHANNELS:
-                return None
-            name = stream.request.__name__
+                return False
             if name not in self._schemas:
-                schema = json.dumps(stream.request.model_json_schema()).encode()
-                self._schemas[name] = self._writer.register_schema(name, SCHEMA_ENCODING, schema)
-            key = stream.key(self._run, ident)
-            self._channels[place] = self._writer.register_channel(
-                key, ENCODING, self._schemas[name]
+                self._schemas[name] = self._writer.register_schema(
+                    name, view.schema.encoding, view.schema.data
+                )
+            self._channels[topic] = self._writer.register_channel(
+                topic, view.encoding, self._schemas[name]
             )
-        return self._channels[place]
+        self._writer.add_message(
+            self._channels[topic], time_ns, view.data, time_ns, sequence=self.messages % 2**32
+        )
+        return True
+
+
+@cache
+def _schema(stream: Stream) -> Schema:
+    message = stream.request
+    fields = json.dumps(message.model_json_schema()).encode()
+    return Schema(name=message.__name__, encoding=SCHEMA_ENCODING, data=fields)
 
 
 def _create(path: Path) -> BinaryIO:

@@ -25,6 +25,17 @@ class Heard:
     data: bytes
 
 
+@dataclass(frozen=True)
+class Version:
+    """A version of the target network."""
+
+    number: int
+    time_ns: int
+    """When it arrived."""
+    data: bytes
+    """As safetensors."""
+
+
 class Tap(Arrivals):
     """Messages of these streams of a run from now on, for a thread that keeps up.
 

@@ -6,6 +6,7 @@ from typing import NamedTuple
 from services.extras import import_installed
 from services.robot_driver.real.link import Link
 from services.robot_driver.robot import Robot, RobotFault
+from shared import plugins
 from shared.config import Config
 from shared.errors import ConfigError, RobotMissing
 
@@ -27,7 +28,7 @@ REAL = {
     "robotino": Kind("robotino", "RobotinoLink", "robotino"),
     "ros2": Kind("ros2", "Ros2Link", "ros2"),
 }
-"""Real robots by `robot.kind`; every other kind is the simulation."""
+"""Real robots by `robot.kind`. Other packages may add to them."""
 
 
 def make_robot(config: Config) -> Robot:
@@ -47,12 +48,16 @@ def make_link(config: Config) -> Link:
         ConfigError: It is a simulated one, it cannot be reached like that, or a library is not
             installed.
     """
-    kind = REAL.get(config.robot.kind)
-    if kind is None:
+    if config.robot.kind == "sim":
         raise ConfigError(f"robot.kind: expected a real robot ({', '.join(REAL)}), got 'sim'")
-    module = import_installed(f"services.robot_driver.real.{kind.module}", kind.extra)
-    link: Link = getattr(module, kind.link)(config)
-    return link
+    kind, link = REAL.get(config.robot.kind), None
+    if kind is None:
+        link = plugins.load(plugins.ROBOTS, config.robot.kind)
+    else:
+        module = import_installed(f"services.robot_driver.real.{kind.module}", kind.extra)
+        link = getattr(module, kind.link)
+    made: Link = link(config)
+    return made
 
 
 def _real(config: Config) -> Robot:

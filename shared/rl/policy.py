@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from shared import plugins
 from shared.facts import ACTION_COUNT
 
 if TYPE_CHECKING:
@@ -33,7 +34,9 @@ def exploring_distribution(values: Values, config: PolicyConfig) -> Floats:
     """What the policy draws from when it does not act greedily."""
     if config.kind == "eps-greedy":
         return np.full(len(values), 1.0 / len(values))
-    return roulette_distribution(values, config.temperature)
+    if config.kind in ("roulette", "eps-greedy-roulette"):
+        return roulette_distribution(values, config.temperature)
+    return np.asarray(plugins.load(plugins.POLICIES, config.kind)(values, config), np.float64)
 
 
 def distribution(values: Values, config: PolicyConfig) -> Floats:

@@ -32,7 +32,7 @@ DEADLINE_S = 90.0
 AT_ONCE = 2
 """Environments that are made and tried beside each other."""
 NEWER = ("3.12", "3.13")
-WITH_TORCH = {"actor", "replay", "learner", "record", "experiments", "openvino", "all"}
+WITH_TORCH = {*("actor", "replay", "learner", "record", "experiments", "export", "openvino", "all")}
 """Not tried with the newer Pythons: their builds of torch would have to be downloaded."""
 
 
@@ -126,6 +126,13 @@ def _record(environment: Environment) -> None:
         pass
 
 
+def _export(environment: Environment) -> None:
+    """It comes as far as looking for the memory, with all its libraries."""
+    code, said = environment.run("export", "memory", "nowhere", "--out", "a.parquet")
+    assert code == 3, said
+    assert "expected a replay memory" in said, said
+
+
 class _Silent(BaseHTTPRequestHandler):
     def log_message(self, form: str, *args: object) -> None:
         """Say nothing."""
@@ -172,6 +179,7 @@ PURPOSES: dict[str, Callable[[Environment], None]] = {
     "replay": _service("replay"),
     "learner": _service("learner"),
     "secure": _command("secure", "init", "secure"),
+    "export": _export,
     "experiments": _command("experiment", "--describe", "plus-rmm"),
     "all": _command("doctor"),
 }

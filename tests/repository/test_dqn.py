@@ -12,7 +12,7 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from benchmarks import dqn
-from benchmarks.dqn import EVALUATIONS, DistanceReward, shared_config
+from benchmarks.dqn import EVALUATIONS, shared_config
 from experiments.drives.choosers import Chooser, uniform
 from experiments.environment import CorridorEnv
 from experiments.plans.plan import stage_config
@@ -118,7 +118,7 @@ def test_without_its_library_one_line_tells_how_to_get_it(
 
 def test_distance_is_from_50_actions_ago_or_the_begin_of_the_episode() -> None:
     config = Config.model_validate({"episode": {"horizon": 4, "max_samples": 9}})
-    env = DistanceReward(CorridorEnv(config=config), config)
+    env = CorridorEnv(config=config, reward="distance")
     start = {"seed": 1, "options": {"pose": Pose(3.8, -2.5, math.pi / 2)}}
     env.reset(**start)
     straight = [env.step(np.int64(FORWARD))[1] for _ in range(7)]
@@ -135,7 +135,7 @@ def test_distance_is_from_50_actions_ago_or_the_begin_of_the_episode() -> None:
 
 def test_distance_tells_circling_from_driving() -> None:
     config = Config()
-    env = DistanceReward(CorridorEnv(config=config), config)
+    env = CorridorEnv(config=config, reward="distance")
     env.reset(seed=1, options={"pose": Pose(4.2, 0.0, math.pi / 2)})
     rewards = [env.step(np.int64(FORWARD_LEFT))[1] for _ in range(100)]
     assert max(rewards) < 0.12

@@ -14,7 +14,7 @@ LONGEST_FUNCTION = 40
 LONGEST_FILE = 350
 TABLES = {"shared/messages.py", "shared/config.py"}
 """Tables: longer on purpose, one row after the other."""
-CROWDED = {"shared": 23, "shared/rl": 21}
+CROWDED = {"shared": 24, "shared/rl": 21}
 """One subject a file, named by it: one look still finds the right one among so many."""
 MOST_FILES = 15
 

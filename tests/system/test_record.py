@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -16,18 +17,16 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(600)]
 DEADLINE_S = 300.0
 
 
-def record(cluster: Cluster, out: Path) -> subprocess.Popen[str]:
+def record(cluster: Cluster, out: Path, *more: str) -> subprocess.Popen[str]:
     place = ["--run-dir", str(cluster.folder), "--endpoint", cluster.config.bus.endpoint]
     file = ["--config", str(cluster.folder.parent / f"{cluster.folder.name}.toml")]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "services.cli", "record", "--out", str(out), *place, *file],
+    return subprocess.Popen(
+        [sys.executable, "-m", "services.cli", "record", "--out", str(out), *place, *file, *more],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
         start_new_session=True,
     )
-    cluster.wait(lambda: recorded(out) >= 0, DEADLINE_S, "the recorder writes")
-    return process
 
 
 def recorded(path: Path) -> int:
@@ -48,6 +47,7 @@ def test_a_recorded_run_gives_its_actions_again(ending: str, run_name: str, tmp_
     with Cluster(config, tmp_path / "run") as cluster:
         cluster.start(*ALL[:-1])
         with record(cluster, out) as process:
+            cluster.wait(lambda: recorded(out) >= 0, DEADLINE_S, "the recorder writes")
             cluster.start("driver")
             cluster.wait_episodes(6, DEADLINE_S)
             if ending == "killed":
@@ -59,6 +59,7 @@ def test_a_recorded_run_gives_its_actions_again(ending: str, run_name: str, tmp_
                 said, _ = process.communicate(timeout=DEADLINE_S)
                 assert process.returncode == 0, said
                 assert "(0 lost)" in said
+                keep_the_last_seconds(cluster, tmp_path)
         cluster.stop_all()
     recording = Recording(out)
     assert recording.complete == (ending == "clean")
@@ -70,3 +71,23 @@ def test_a_recorded_run_gives_its_actions_again(ending: str, run_name: str, tmp_
     equal, total, exact = map(int, found.groups())
     assert equal == total == exact
     assert equal > 300, said  # the memory holds 400, filled before the first episode
+
+
+def keep_the_last_seconds(cluster: Cluster, folder: Path) -> None:
+    """A signal writes what was kept, and so does the end; both play back."""
+    with record(cluster, folder / "last.mcap", "--last", "600") as process:
+        assert process.stdout is not None
+        assert any("kill -USR1" in line for line in process.stdout)
+        learner = cluster.learner()
+        assert learner is not None
+        cluster.wait_episodes(learner.episode + 3, DEADLINE_S)
+        process.send_signal(signal.SIGUSR1)
+        cluster.wait(lambda: (folder / "last-1.mcap").exists(), DEADLINE_S, "the signal writes")
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=DEADLINE_S)
+    messages = []
+    for number in (1, 2):
+        code, said = playback(folder / f"last-{number}.mcap")
+        assert code == 0, said
+        messages.append(Recording(folder / f"last-{number}.mcap").summary["messages"])
+    assert 0 < messages[0] <= messages[1]

@@ -7,6 +7,7 @@ Units are metres and degrees, x to the right and y up on the map.
 """
 
 import hashlib
+import math
 import tomllib
 from collections.abc import Collection
 from functools import cached_property
@@ -32,7 +33,9 @@ from services.robot_driver.simulated.world_parts import (
     Wall,
     inside,
 )
+from shared import plugins
 from shared.errors import ConfigError, first_problem, meant
+from shared.messages import Box
 
 WORLDS = Path(__file__).parent / "worlds"
 """Folder of the worlds that come with the driver."""
@@ -262,18 +265,39 @@ def world_path(name: str) -> Path:
     if name.endswith(".toml"):
         return Path(name)
     files = world_files()
-    if name not in files:
-        there = ", ".join(files)
-        raise WorldError(f"no world named {name!r}; there are: {there}{meant(name, files)}")
-    return files[name]
+    if name in files:
+        return files[name]
+    try:
+        return Path(plugins.load(plugins.WORLDS, name))
+    except KeyError:
+        known = (*files, *plugins.names(plugins.WORLDS))
+        there = f"{', '.join(known)}{meant(name, known)}"
+        raise WorldError(f"no world named {name!r}; there are: {there}") from None
 
 
 def load_world(name: str) -> World:
-    """The world of that name: one that comes with the driver, or one in `worlds/`.
+    """The world of that name: one that comes along, one in `worlds/`, or another package's.
 
     Raises WorldError: there is none of that name, or its file is wrong.
     """
     return read_world(world_path(name))
+
+
+def solids(name: str) -> list[Box]:
+    """The walls and boxes of a world, for pictures of it; none where it cannot be read."""
+    try:
+        world = load_world(name)
+    except WorldError:
+        return []
+    found = [Box.model_validate(obstacle.model_dump()) for obstacle in world.obstacles]
+    for wall in world.walls:
+        for i, (ax, ay, bx, by) in enumerate(wall.segments.tolist()):
+            side = {"x_m": (ax + bx) / 2, "y_m": (ay + by) / 2, "width_m": 0.02}
+            side |= {"heading_deg": math.degrees(math.atan2(by - ay, bx - ax))}
+            side |= {"length_m": float(wall.lengths[i]), "height_m": world.height_m}
+            rgb = world.textures[wall.texture_of(i)].rgb
+            found.append(Box.model_validate({"name": f"{wall.name}-{i}", "rgb": rgb, **side}))
+    return found
 
 
 def read_world(path: Path) -> World:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from shared import plugins
 from shared.facts import ACTION_COUNT
 from shared.rl.draws import uniform
 from shared.rl.retention.table import STRATEGIES, TELLS
@@ -118,8 +119,17 @@ def lowest(values: Floats, count: int) -> npt.NDArray[np.int64]:
 
 
 def strategy(name: str) -> Strategy:
-    """Return the strategy of this name. Raises KeyError for an unknown one."""
-    row = STRATEGIES[name]
+    """Return the strategy of this name, ours or another package's.
+
+    Raises KeyError for an unknown one, ValueError for one with columns that is not ours: the
+    memory has those of our table.
+    """
+    row = STRATEGIES.get(name)
+    if row is None:
+        added: Strategy = plugins.load(plugins.RETENTION, name)
+        if added.columns:
+            raise ValueError(f"strategy {name!r}: only those of the table may have columns")
+        return added
     found: Strategy = getattr(import_module(f"{__package__}.{row.module}"), row.name)
     return found
 
@@ -132,7 +142,9 @@ def columns() -> list[tuple[Any, ...]]:
 def begin(config: MemoryConfig) -> dict[str, int]:
     """Return what all strategies begin with under these settings."""
     return {
-        key: value for name in STRATEGIES for key, value in strategy(name).begin(config).items()
+        key: value
+        for name in dict.fromkeys((*STRATEGIES, config.strategy))
+        for key, value in strategy(name).begin(config).items()
     }
 
 
@@ -152,7 +164,7 @@ def discard(there: Situation) -> Discard:
         memory.remove(done.ids)
     memory.set_capacity(done.capacity)
     memory.kept |= done.keep
-    told = {**{name: memory.kept.get(name, 0) for name in TELLS}, **done.told}
+    told = {name: done.told.get(name, memory.kept.get(name, 0)) for name in TELLS}
     return replace(done, marked=done.marked or prepared, told=told)
 
 

@@ -8,11 +8,14 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from builders import make_images
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from shared import run_record
 from shared.config import Config
 from shared.errors import DiskFull
 from shared.metrics import MetricsLog
+from shared.rl.network import initialised
 from shared.run_record import EPISODE_COLUMNS, REPLAY_COLUMNS, TRAINING_COLUMNS, RunInfo
 
 
@@ -89,3 +92,16 @@ cut: list[int] = []
 
 def fails(*_: object) -> None:
     raise OSError("no space")
+
+
+def test_tensorboard_has_settings_weights_and_what_is_predicted_for_images(tmp_path: Path) -> None:
+    config = Config.model_validate({"network": {"filters": 4}})
+    metrics = MetricsLog(tmp_path / "training.csv", TRAINING_COLUMNS, config)
+    metrics.show_network(5, initialised(config.network, seed=1), make_images(3))
+    metrics.close()
+    found = EventAccumulator(str(tmp_path / "tensorboard" / "training")).Reload()
+    assert "weights/conv1.weight" in found.Tags()["histograms"]
+    (probes,) = found.Images("probes")
+    assert (probes.width, probes.height) == (3 * 75, 50 + 3 * 6)
+    data = found.summary_metadata["_hparams_/session_start_info"].plugin_data.content
+    assert b"network.filters" in data

@@ -76,17 +76,18 @@ def alone(
     env: CorridorEnv, network: Predicts, number: int, pose: Pose, actions: int
 ) -> tuple[list[Turn], tuple[int, int]]:
     """One robot after the other, one prediction for one action; also laps left and right."""
-    seen: Observation = env.reset(seed=number, options={"pose": pose})[1]["observation"]
+    env.reset(seed=number, options={"pose": pose})
+    seen = env.seen
     draw, turns = generator(SEED, "action", number), []
     for _ in range(actions):
         values = network.all_values(image_array(seen.image)[None])[0]
         before = env.robot.pose
-        _, _, bump, _, info = env.step(np.int64(choose(values, GREEDY, draw)[0]))
+        bump = env.step(np.int64(choose(values, GREEDY, draw)[0]))[2]
         here = env.robot.pose
         way_m = math.hypot(here.x_m - before.x_m, here.y_m - before.y_m)
         if bump:
-            info = env.reset()[1]
-        seen = info["observation"]
+            env.reset()
+        seen = env.seen
         turns.append(Turn(bump, way_m, seen))
     return turns, (env.robot.laps.left, env.robot.laps.right)
 

@@ -16,6 +16,7 @@ from experiments.records import EVALUATION_COLUMNS, WALL_TIME
 from experiments.runs.run import Run
 from experiments.runs.schedule import Job, _distinct, chain, shares_of
 from experiments.runs.totals import Progress
+from services.commander import frozen
 from shared import run_record
 from shared.errors import ConfigError, StateError
 
@@ -295,9 +296,9 @@ def test_a_plan_without_stages_has_the_weights_that_it_goes_on_from(
     monkeypatch.setattr("experiments.runs.observer.drive_tour", short)
     folder = tmp_path / "x" / "drive"
     assert run(TEST_DRIVE, folder, finished / "one")
-    learned = (finished / "one" / "weights.safetensors").read_bytes()
-    assert (folder / "weights.safetensors").read_bytes() == learned
-    assert (folder / "best.safetensors").read_bytes() == learned
+    learned = frozen.read(finished / "one" / "weights.safetensors").data
+    for name in ("weights.safetensors", "best.safetensors"):
+        assert frozen.read(folder / name).data == learned
 
 
 def test_the_share_of_episodes_of_one_action_is_recorded(finished: Path) -> None:

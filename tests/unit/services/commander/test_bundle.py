@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from safetensors import safe_open
-from safetensors.torch import load_file
+from safetensors.torch import load as load_tensors
+from safetensors.torch import load_file, save
 
 from services.commander import bundle, frozen
 from shared.config import Config
 from shared.errors import ConfigError, StateError
+from shared.provenance import BUNDLE
 from shared.rl.network import initialised, to_bytes
 from shared.settings import claim, load
 
@@ -33,8 +35,8 @@ def file(tmp_path: Path) -> Path:
 def changed(file: Path, **changes: object) -> frozen.Frozen:
     """The bundle with other contents, as another version of the program would write it."""
     found = frozen.read(file)
-    content = json.loads(found.metadata[bundle.KEY]) | changes
-    file.write_bytes(found.packed({bundle.KEY: json.dumps(content)}))
+    content = json.loads(found.metadata[BUNDLE]) | changes
+    file.write_bytes(save(load_tensors(found.data), {BUNDLE: json.dumps(content)}))
     return frozen.read(file)
 
 
@@ -56,7 +58,7 @@ def test_other_programs_read_it_as_plain_weights(file: Path, tmp_path: Path) -> 
     plain.write_bytes(WEIGHTS)
     assert load_file(file).keys() == load_file(plain).keys()
     with safe_open(file, framework="np") as opened:
-        assert json.loads(opened.metadata()[bundle.KEY])["actions"][0] == "forward"
+        assert json.loads(opened.metadata()[BUNDLE])["actions"][0] == "forward"
     assert bundle.of(frozen.read(plain)) is None
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import json
+import math
+import re
 import struct
 from collections.abc import Callable
 from contextlib import suppress
@@ -16,13 +19,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
+from mcap_protobuf.decoder import DecoderFactory
 
 from services.cli import main as cli
 from services.recorder import playback
-from services.recorder.reader import MAX_RECORD_BYTES, Recording
+from services.recorder.reader import MAX_CHUNK_BYTES, MAX_RECORD_BYTES, Recording
 from services.recorder.recording import Origin, RecordingWriter
+from services.recorder.ring import Ring
 from services.recorder.service import actor_numerics
-from services.recorder.tap import Heard
+from services.recorder.tap import Heard, Version
+from services.robot_driver.simulated.world import solids
 from shared.codec import encode
 from shared.config import ActorNumerics, Config
 from shared.errors import ConfigError, StateError
@@ -90,12 +96,12 @@ def drive(count: int) -> list[tuple[Observation, Action]]:
 
 
 def write(path: Path, turns: list[tuple[Observation, Action]], **kwargs: Any) -> Path:
-    with RecordingWriter(path, Origin(CONFIG, NUMERICS, **kwargs)) as writer:
+    with RecordingWriter(path, Origin(CONFIG, NUMERICS, **kwargs), solids) as writer:
         for i, (observation, action) in enumerate(turns):
             writer.add(heard(observation, 2 * i))
             writer.add(heard(action, 2 * i + 1))
         for version, data in WEIGHTS.items():
-            writer.add_weights(version, data, 9)
+            writer.add(Version(version, 9, data))
         writer.add_summary({"messages": writer.messages, "lost.observation": 0})
     return path
 
@@ -123,21 +129,40 @@ def test_what_was_written_is_read(whole: Path, turns: list[tuple[Observation, Ac
     assert recording.undecodable == 0
 
 
-def test_other_tools_read_it(whole: Path) -> None:
+def test_other_tools_read_it(whole: Path, turns: list[tuple[Observation, Action]]) -> None:
+    """By the reader of the container's own library, with the schemas that the file brings along."""
+    seen: dict[str, list[Any]] = {}
     with whole.open("rb") as file:
-        reader = make_reader(file)
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
         summary = reader.get_summary()
         assert summary is not None
+        assert {c.compression for c in summary.chunk_indexes} == {"zstd"}
         topics = {c.topic: c.message_encoding for c in summary.channels.values()}
-        assert topics == {
-            "lab/robot/robot1/observation": "msgpack",
-            "lab/actor/robot1/action": "msgpack",
+        plain = {name for name, encoding in topics.items() if encoding != "protobuf"}
+        views = topics.keys() - plain
+        assert plain - {"/robot1/prediction"} == {
+            "lab/robot/robot1/observation",
+            "lab/actor/robot1/action",
         }
-        assert {s.name: s.encoding for s in summary.schemas.values()} == {
-            "Observation": "jsonschema",
-            "Action": "jsonschema",
-        }
-        assert len(list(reader.iter_messages())) == 48
+        for _, channel, _, decoded in reader.iter_decoded_messages(topics=views):
+            seen.setdefault(channel.topic, []).append(decoded)
+        for _, _, message in reader.iter_messages(topics=["/robot1/prediction"]):
+            seen.setdefault("/robot1/prediction", []).append(json.loads(message.data))
+    observation, action = turns[7]
+    image, pose = seen["/robot1/image"][7], seen["/robot1/pose"][7].pose
+    assert (image.width, image.height, image.encoding) == (75, 50, "mono8")
+    assert image.data == observation.image
+    assert (pose.position.x, pose.position.y) == (observation.x_m, observation.y_m)
+    assert 2 * math.atan2(pose.orientation.z, pose.orientation.w) == pytest.approx(
+        observation.heading_rad
+    )
+    assert seen["/tf"][7].child_frame_id == "robot1"
+    assert seen["/robot1/prediction"][7]["left"] == action.values[1]
+    layout = (Path(__file__).parents[4] / "docs/foxglove-layout.json").read_text()
+    named = re.findall(r"/(?:robotino1/)?[a-z]+", layout)
+    assert {topic.replace("robotino1", "robot1") for topic in named} <= seen.keys()
+    (world,) = seen["/world"]
+    assert len(world.entities[0].cubes) == len(solids(observation.world)) > 4
 
 
 def test_nothing_is_overwritten(whole: Path) -> None:
@@ -154,13 +179,34 @@ def test_what_was_flushed_survives_a_kill(tmp_path: Path, turns: Any) -> None:
         writer.add(heard(observation))
         writer.add(heard(action))
     writer.flush()
+    whole_chunks = path.stat().st_size
     writer.add(heard(turns[5][0]))
+    writer.flush()
     copy = tmp_path / "copy.mcap"
-    copy.write_bytes(path.read_bytes())  # what another process would find now
-    recording = Recording(copy)
-    assert not recording.complete
-    assert len(list(recording.messages())) == 10
+    for cut in (whole_chunks, whole_chunks + 99):  # killed between two chunks, and within one
+        copy.write_bytes(path.read_bytes()[:cut])
+        recording = Recording(copy)
+        assert not recording.complete
+        assert len(list(recording.messages())) == 10
     writer.__exit__(None, None, None)
+
+
+def test_the_last_seconds_are_kept_with_the_weights_they_need(
+    tmp_path: Path, turns: list[tuple[Observation, Action]]
+) -> None:
+    ring = Ring(last_s=2.0)
+    for second, (observation, action) in enumerate(turns[10:16]):
+        if second in (0, 1, 2):
+            ring.add(Version(second, int(second * 1e9), WEIGHTS[1 + second % 2]))
+        ring.add(heard(observation, int(second * 1e9)))
+        ring.add(heard(action, int(second * 1e9)))
+    path = tmp_path / "last.mcap"
+    with RecordingWriter(path, Origin(CONFIG, NUMERICS)) as writer:
+        ring.write(writer)
+    recording = Recording(path)
+    assert list(recording.messages()) == [m for turn in turns[13:16] for m in turn]
+    assert set(recording.weights) == {1, 2}
+    assert (ring.messages, ring.refused) == (6, 0)
 
 
 # ------------------------------------------------------------------------- foreign bytes
@@ -200,42 +246,49 @@ def foreign(path: Path, fill: Callable[[Writer], None], compression: Any = None)
     return path
 
 
-def add(writer: Writer, name: str, topic: str, data: bytes, encoding: str = "msgpack") -> None:
+def add(writer: Writer, name: str, topic: str, data: bytes) -> None:
     schema = writer.register_schema(name, "jsonschema", b"{}")
-    channel = writer.register_channel(topic, encoding, schema)
+    channel = writer.register_channel(topic, "msgpack", schema)
     writer.add_message(channel, 0, data, 0)
 
 
 @pytest.mark.parametrize(
-    ("name", "topic", "data", "encoding"),
+    ("name", "topic", "data"),
     [
-        ("Observation", "lab/robot/robot1/observation", b"", "msgpack"),
-        ("Observation", "lab/robot/robot1/observation", bytes(9000), "msgpack"),
-        ("Observation", "lab/robot/robot1/observation", encode(make_observation(1)), "json"),
-        ("Observation", "lab/robot/other/observation", encode(make_observation(1)), "msgpack"),
-        ("Observation", "lab/robot/*/observation", encode(make_observation(1)), "msgpack"),
-        ("Observation", "lab/actor/robot1/action", encode(make_observation(1)), "msgpack"),
-        ("os.system", "lab/robot/robot1/observation", encode(make_observation(1)), "msgpack"),
+        ("Observation", "lab/robot/robot1/observation", b""),
+        ("Observation", "lab/robot/robot1/observation", bytes(9000)),
+        ("Observation", "lab/robot/other/observation", encode(make_observation(1))),
+        ("Observation", "lab/robot/*/observation", encode(make_observation(1))),
+        ("Observation", "lab/actor/robot1/action", encode(make_observation(1))),
+        ("os.system", "lab/robot/robot1/observation", encode(make_observation(1))),
     ],
-    ids=["empty", "large", "encoding", "sender", "wildcard", "key", "name"],
+    ids=["empty", "large", "sender", "wildcard", "key", "name"],
 )
 def test_what_is_no_message_of_the_protocol_is_left_out_and_counted(
-    tmp_path: Path, name: str, topic: str, data: bytes, encoding: str
+    tmp_path: Path, name: str, topic: str, data: bytes
 ) -> None:
-    path = foreign(tmp_path / "f.mcap", lambda w: add(w, name, topic, data, encoding))
+    path = foreign(tmp_path / "f.mcap", lambda w: add(w, name, topic, data))
     recording = Recording(path)
     assert list(recording.messages()) == []
     assert recording.undecodable == 1
 
 
-def test_compressed_chunks_are_refused(tmp_path: Path) -> None:
-    some = encode(make_observation(1))
+@pytest.mark.parametrize(
+    ("compression", "size", "complaint"),
+    [
+        (CompressionType.LZ4, 100, "expected zstd"),
+        (CompressionType.ZSTD, MAX_CHUNK_BYTES, "a chunk of"),
+    ],
+)
+def test_chunks_are_bounded_before_they_are_decompressed(
+    tmp_path: Path, compression: CompressionType, size: int, complaint: str
+) -> None:
     path = foreign(
         tmp_path / "f.mcap",
-        lambda w: add(w, "Observation", "lab/robot/robot1/observation", some),
-        CompressionType.ZSTD,
+        lambda w: add(w, "Observation", "lab/robot/robot1/observation", bytes(size)),
+        compression,
     )
-    with pytest.raises(StateError, match="decompress it first"):
+    with pytest.raises(StateError, match=complaint):
         list(Recording(path).messages())
 
 
@@ -321,7 +374,7 @@ def test_damaged_weights_are_refused(tmp_path: Path, turns: Any) -> None:
     with RecordingWriter(path, Origin(CONFIG, NUMERICS)) as writer:
         writer.add(heard(turns[20][0]))
         writer.add(heard(turns[20][1]))
-        writer.add_weights(2, WEIGHTS[2][:-8], 0)
+        writer.add(Version(2, 0, WEIGHTS[2][:-8]))
     with pytest.raises(StateError, match="recorded weights of version 2"):
         playback.compare(Recording(path))
 
