@@ -82,7 +82,7 @@ peers-test: $(PEERS)/.peers ## do others' learners train on the environments? in
 
 clean: ## remove the virtual environments and all caches; runs stay
 	rm -rf $(VENV) $(PEERS) build *.egg-info .mypy_cache .ruff_cache .hypothesis .import_linter_cache
-	find shared services experiments benchmarks tests -name __pycache__ -prune -exec rm -rf {} +
+	find shared services experiments benchmarks tools tests -name __pycache__ -prune -exec rm -rf {} +
 
 # ---------------------------------------------------------------- the virtual environment
 

@@ -85,7 +85,7 @@ def test_make_targets_exist(page: Path) -> None:
 
 @on_every_page
 def test_files_named_exist(page: Path) -> None:
-    top = "shared|services|experiments|tests|docs|benchmarks"
+    top = "shared|services|experiments|tests|docs|benchmarks|tools"
     for text in code(page):
         if re.fullmatch(rf"(?:{top})/[\w./-]*", text):
             assert (ROOT / text).exists(), text

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from experiments.report import archives
 from experiments.report.run_folder import load
 from shared.errors import ConfigError, StateError
 from tests.synthetic_runs import write_run
+from tools import archives
 
 NAME = "plus-rmm"
 

@@ -10,10 +10,10 @@ import pytest
 
 from experiments.report.document import Findings, Missing, Picture, Table
 from experiments.report.ratios import ratios
-from experiments.retention import report as retention
 from experiments.retention.benchmark import load_benchmark
 from experiments.retention.work import Measured, Network
 from shared.errors import StateError
+from tools import retention
 
 BENCHMARK = load_benchmark()
 

@@ -1,6 +1,6 @@
 """The page of results: text by hand, with figures and tables of the runs kept with the code.
 
-    python -m experiments.results [RUNS]... [--arrays]
+    python -m tools.results [RUNS]... [--arrays]
 
 adds RUNS to the archives in `docs/results/` and writes `docs/results.md` and its pictures anew.
 Without RUNS it writes the page from what is kept, which gives the same page again. The text is
@@ -16,14 +16,14 @@ from typing import Annotated
 
 import typer
 
-from experiments.report import archives
 from experiments.report.document import Block, Findings, Picture, Section, Table, block_text
 from experiments.report.full_report import all_sections
-from experiments.retention.report import kept_section
 from shared.errors import CorridorError, StateError
+from tools import archives
+from tools.retention import kept_section
 
 DOCS = Path(__file__).parents[1] / "docs"
-NOTICE = "<!-- Written by `python -m experiments.results` from `docs/results/`. -->\n\n"
+NOTICE = "<!-- Written by `python -m tools.results` from `docs/results/`. -->\n\n"
 _SHOWN = re.compile(r"<!-- show: (\S+) -->")
 
 

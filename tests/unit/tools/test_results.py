@@ -9,10 +9,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from experiments import results
-from experiments.report import archives
 from shared.errors import StateError
 from tests.synthetic_runs import write_run
+from tools import archives, results
 
 NAMES = ("policy-eps-greedy", "policy-roulette")
 TEMPLATE = """# A page

@@ -1,6 +1,6 @@
 """What the benchmark of retention found: tables, verdicts and figures (docs/comparison.md).
 
-    python -m experiments.retention.report [MEASURED]
+    python -m tools.retention [MEASURED]
 
 adds the results in the folder MEASURED (`<out>/measured` of `corridor retention`) to those that are
 kept with the code.

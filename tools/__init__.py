@@ -1,0 +1,1 @@
+"""What keeps results with the code and writes the page about them; it needs a checkout."""
