@@ -6,8 +6,6 @@ of `shared.settings`. Cited constants come from the thesis (A.., Eq ..) and the 
 errata (E..), see docs/algorithm.md.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,7 +1,5 @@
 """What a run, a network or a measurement was made with: commit, processor, versions, robot."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -5,8 +5,6 @@ each action afresh (Eq 3.1), beside the prediction it had. A network whose rewar
 alike still ranks actions well now and then; how far its predictions reach shows it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whether a person drives a robot in place of the network, and what they want now. No clock."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """The keys of a terminal as a person's wishes, and the emergency stop among them."""
 
-from __future__ import annotations
-
 import os
 import select
 import sys

@@ -3,8 +3,6 @@
 Address and token lie in the run folder, so that a page that was restarted is found where it was.
 """
 
-from __future__ import annotations
-
 import random
 import re
 import secrets

@@ -3,8 +3,6 @@
 Images stay on disk until they are looked at. Nothing here needs torch; see `elsewhere`.
 """
 
-from __future__ import annotations
-
 import asyncio
 from base64 import b64encode
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What a browser may ask for, checked, and carried out beside the thread that answers browsers."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

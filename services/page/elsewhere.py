@@ -1,7 +1,5 @@
 """What needs torch: done in one process of its own, started when it is first asked for."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import threading

@@ -1,7 +1,5 @@
 """What the folder of a run tells: curves, findings, obstacles, notes, and maps of its worlds."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """The figures of a run for Prometheus: every number of the newest heartbeats."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 from prometheus_client.core import GaugeMetricFamily

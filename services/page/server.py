@@ -4,8 +4,6 @@ A browser gets the next update when it has painted the last one, at most five a 
 too slow for is never sent.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import secrets

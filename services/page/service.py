@@ -1,7 +1,5 @@
 """`corridor page`: puts the parts of the page together and serves them until it is stopped."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

@@ -3,8 +3,6 @@
 No bus and no clock in here.
 """
 
-from __future__ import annotations
-
 import math
 from base64 import b64encode
 from collections import deque

@@ -4,8 +4,6 @@ It is told in sections. One that has not changed stays the same object, so that 
 only what is new to it. Of a run that is not up, the folder alone is told.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import threading

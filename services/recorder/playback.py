@@ -4,8 +4,6 @@ Every recorded observation goes through preprocessing, the recorded network and 
 with the recorded seed and numerics; what comes out is compared with the recorded action.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
