@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import threading
 import time
@@ -14,7 +15,7 @@ from shared.complaints import Complaints
 from shared.errors import BadMessage, BusError, PeerSilent
 from shared.keys import LEARNER_STATE, WEIGHTS
 from shared.messages import LearnerState, Weights, WeightsRequest
-from shared.rl.network import MAX_WEIGHT_BYTES, QNetwork, WeightsHash, checked
+from shared.rl.network import MAX_WEIGHT_BYTES, QNetwork, checked
 from shared.service import TICK_S, Service, Stopped
 
 if TYPE_CHECKING:
@@ -41,12 +42,12 @@ def fetch(bus: Bus, *, everybody: bool = False) -> tuple[int, bytes]:
 
     everybody: ask all who serve weights, in place of the one that the router chooses.
     """
-    received, digest, size = [], WeightsHash(), 0
+    received, digest, size = [], hashlib.sha256(), 0
     replies = bus.request_many(
         WEIGHTS, WeightsRequest(), Weights, patience_s=PATIENCE_S, everybody=everybody
     )
     for message in replies:
-        digest.add(message.data)  # while the next part is on its way
+        digest.update(message.data)  # while the next part is on its way
         received.append(message)
         size += len(message.data)
         if everybody and len(received) == message.parts:
@@ -56,7 +57,7 @@ def fetch(bus: Bus, *, everybody: bool = False) -> tuple[int, bytes]:
     first = received[0]
     if [m.part for m in received] != list(range(first.parts)):
         raise PeerSilent(f"weights: expected {first.parts} parts, got {len(received)}")
-    if {(m.version, m.hash) for m in received} != {(first.version, digest.text)}:
+    if {(m.version, m.hash) for m in received} != {(first.version, digest.hexdigest()[:16])}:
         raise BadMessage(f"weights: parts of version {first.version} do not match their hash")
     return first.version, b"".join(message.data for message in received)
 

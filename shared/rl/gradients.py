@@ -6,7 +6,6 @@ decides the order of additions, and with it the last bits.
 
 from __future__ import annotations
 
-import math
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
@@ -14,9 +13,8 @@ import torch
 from torch import Tensor
 
 from shared.rl import trunk
-from shared.rl.batches import Batches, Mask, Ranks, ResidentBatches
+from shared.rl.batches import Batches, Mask, Ranks
 from shared.rl.engine import arithmetic, scaled
-from shared.rl.memory import SampleStore
 from shared.rl.network import QNetwork
 
 if TYPE_CHECKING:
@@ -32,18 +30,6 @@ class Gradients:
         self._pool = ThreadPoolExecutor(max(1, numerics.threads), "share of a mini-batch")
         self.deferred = numerics.device != "cpu"
         """Whether a fitting phase never waits for the device: losses are read at its end."""
-
-    def stored(self, samples: SampleStore) -> Batches:
-        """Mini-batches gathered from the store one by one."""
-        return Batches(samples, self._numerics.device)
-
-    def of_fit(self, samples: SampleStore) -> Batches:
-        """Mini-batches of a fitting phase; on a device not waited for, all at once."""
-        return (
-            ResidentBatches(samples, self._numerics.device)
-            if self.deferred
-            else self.stored(samples)
-        )
 
     def compute(self, batches: Batches, ranks: Ranks, mirrored: Mask | None = None) -> Tensor:
         """Put the gradient of a mini-batch where the optimiser looks; returns the loss.
@@ -87,25 +73,6 @@ class Gradients:
             return loss.detach(), *torch.autograd.grad(loss, list(network.parameters()))
 
 
-class Losses:
-    """The losses of a fitting phase, read at once or, deferred, at its end."""
-
-    def __init__(self, *, deferred: bool = False) -> None:
-        self._deferred = deferred
-        self._unread: list[Tensor] = []
-
-    def read(self, loss: Tensor, *, last: bool) -> float | None:
-        """The loss of a step, or the mean of all at the last one; None where it is not known yet.
-
-        Raises FloatingPointError for a loss that is not finite; deferred, at the last step only:
-        the weights are useless then.
-        """
-        if not self._deferred:
-            return _checked(float(loss))
-        self._unread.append(loss)
-        return _checked(float(torch.stack(self._unread).mean())) if last else None
-
-
 class MeanOfWeights:
     """The mean of a network's weights after several steps."""
 
@@ -135,10 +102,3 @@ class MeanOfWeights:
         if self.count:
             for own, mean in zip(network.parameters(), self._mean, strict=True):
                 own.copy_(mean)
-
-
-def _checked(loss: float) -> float:
-    """Raise FloatingPointError for a loss that is not finite."""
-    if not math.isfinite(loss):
-        raise FloatingPointError(f"loss is {loss}")
-    return loss

@@ -194,27 +194,9 @@ def checked(network: QNetwork, data: bytes, *, shaped: bool = True) -> dict[str,
     return tensors
 
 
-class WeightsHash:
-    """First 16 hex digits of SHA-256 over safetensors bytes, given part by part."""
-
-    def __init__(self) -> None:
-        self._sha = hashlib.sha256()
-
-    def add(self, data: bytes) -> None:
-        """Take in the next part."""
-        self._sha.update(data)
-
-    @property
-    def text(self) -> str:
-        """The hash of all parts so far."""
-        return self._sha.hexdigest()[:16]
-
-
 def weights_hash(data: bytes) -> str:
-    """The `WeightsHash` of whole safetensors bytes."""
-    digest = WeightsHash()
-    digest.add(data)
-    return digest.text
+    """First 16 hex digits of SHA-256 over safetensors bytes."""
+    return hashlib.sha256(data).hexdigest()[:16]
 
 
 def parameter_count(network: QNetwork) -> int:
