@@ -1,8 +1,4 @@
-"""How the gradient of a mini-batch is computed: shares, precision, deferral, means of weights.
-
-What is learnt, and when, stands in `learning`. Nothing here changes what the rule asks for; it
-decides the order of additions, and with it the last bits.
-"""
+"""How the gradient of a mini-batch is computed: shares, precision, means of weights."""
 
 from __future__ import annotations
 
@@ -35,8 +31,7 @@ class Gradients:
         """Put the gradient of a mini-batch where the optimiser looks; returns the loss.
 
         Each thread takes one share of the mini-batch, and the shares are added up in order: the
-        result depends on the number of threads, never on how they run. Threads that wait for each
-        other after every operation would be slower, and hopeless beside another busy process.
+        result depends on the number of threads, never on how they run.
         """
         size = -(-len(ranks) // self._numerics.threads)
         shares = [slice(start, start + size) for start in range(0, len(ranks), size)]

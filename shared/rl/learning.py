@@ -1,7 +1,4 @@
-"""What the network learns and when (sections 3.4.2, 3.4.3, 3.5.3): step, fit, target rule.
-
-How a gradient is computed stands in `gradients`; nothing here depends on it.
-"""
+"""What the network learns and when (sections 3.4.2, 3.4.3, 3.5.3): step, fit, target rule."""
 
 from __future__ import annotations
 
@@ -39,10 +36,7 @@ class Trained:
 
 
 class Trainer:
-    """The train network with its optimiser, and the target network copied from it.
-
-    The two are named by role, never by symbol (E4). Only target versions leave the learner.
-    """
+    """The train network with its optimiser, and the target network copied from it (E4)."""
 
     def __init__(
         self, network: NetworkConfig, learning: LearningConfig, numerics: Numerics, seed: int
@@ -72,10 +66,7 @@ class Trainer:
         self._learning = learning
 
     def learn(self, samples: SampleStore, now: Moment) -> Iterator[Trained]:
-        """Everything the network learns after one episode (E25); yields after each mini-batch.
-
-        A fitting phase when due, else `mini_batches_per_episode` steps.
-        """
+        """Everything learnt after one episode (E25), a fit when due. Yields after a mini-batch."""
         self._mean.restart()
         if not len(samples):
             return

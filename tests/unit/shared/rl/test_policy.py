@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shared.config import Config, PolicyConfig
-from shared.rl.decision import decide
 from shared.rl.draws import generator
-from shared.rl.policy import choose, choose_uniformly, distribution
+from shared.rl.policy import choose, choose_uniformly, decide, distribution
 
 Kind = Literal["eps-greedy", "roulette", "eps-greedy-roulette"]
 KINDS: tuple[Kind, ...] = ("eps-greedy", "roulette", "eps-greedy-roulette")
