@@ -1,8 +1,7 @@
 """The one table of streams: key, message types, who sends, who receives, how it is delivered.
 
 Keys start with the run name, then the sender (`<run>/robot/<robot>/observation`), so that two runs
-never mix and allow-lists per role stay short. `docs/protocol.md` is checked against this table by
-a test. There are two kinds of delivery and no third:
+never mix and allow-lists per role stay short. There are two kinds of delivery and no third:
 
 latest   published. The receiver holds one message per key, and a newer one replaces an unread
          older one. The next heartbeat or a repetition replaces a lost message.
@@ -54,11 +53,6 @@ class Stream:
         """How it is delivered."""
         return "request" if self.reply else "latest"
 
-    @property
-    def overflow(self) -> str:
-        """What becomes of more than the queue holds."""
-        return BUSY if self.reply else NEWEST
-
     def key(self, run: str, ident: str = "") -> str:
         """The concrete key. Raises ValueError for a name that could widen the key."""
         for chunk in (run, *([ident] if "{id}" in self.pattern else [])):
@@ -94,10 +88,6 @@ def check_sender(stream: Stream, ident: str, message: m.Message) -> None:
         raise BadMessage(
             f"{kind} of {getattr(message, 'robot', '')!r:.60} under the key of {ident}"
         )
-
-
-NEWEST = "newer replaces unread older"
-BUSY = "error reply 'busy', the sender repeats it"
 
 
 # fmt: off

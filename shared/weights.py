@@ -38,10 +38,7 @@ def parts(version: int, data: bytes, digest: str) -> Iterator[Weights]:
 
 
 def fetch(bus: Bus, *, everybody: bool = False) -> tuple[int, bytes]:
-    """The newest version and its safetensors bytes. Raises BusError or BadMessage.
-
-    everybody: ask all who serve weights, in place of the one that the router chooses.
-    """
+    """The newest version and its safetensors bytes. Raises BusError or BadMessage."""
     received, digest, size = [], hashlib.sha256(), 0
     replies = bus.request_many(
         WEIGHTS, WeightsRequest(), Weights, patience_s=PATIENCE_S, everybody=everybody
@@ -63,11 +60,7 @@ def fetch(bus: Bus, *, everybody: bool = False) -> tuple[int, bytes]:
 
 
 class Wanted:
-    """Which version to ask for, and when: as the newest announcement says, true or not.
-
-    A version that was never made must not keep a true one away. What is announced and yet does not
-    come is asked for ever more rarely.
-    """
+    """Which version to ask for, and when: ever more rarely for what is announced and not there."""
 
     def __init__(self) -> None:
         self.version = 1
@@ -93,8 +86,7 @@ class Wanted:
 class WeightsFetcher(threading.Thread):
     """Holds the newest target network; a learner that does not answer holds up nobody.
 
-    What does not fit the run's network is refused: the weights before it stay. `notify` is called
-    whenever there is a newer version (from this thread).
+    What does not fit the network is refused. `notify` is called from this thread for a newer one.
     """
 
     def __init__(self, me: Service, notify: Callable[[], None]) -> None:
