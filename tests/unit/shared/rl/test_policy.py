@@ -154,4 +154,4 @@ def test_filling_draws_apart_from_driving() -> None:
     config, values = Config(), np.zeros(3, np.float32)
     draws = [generator(config.run.seed, "fill", "robot", 2, step) for step in range(50)]
     filled = [decide(config, "robot", values, filling=True, episode=2, step=s) for s in range(50)]
-    assert filled == [(choose_uniformly(draw), False) for draw in draws]
+    assert filled == [(choose_uniformly(draw), "chance") for draw in draws]
