@@ -32,7 +32,7 @@ from benchmarks.waiting import wait_until
 from shared.bus import Bus, Inbox, Request, open_router
 from shared.config import BusConfig
 from shared.halts.book import new_halt
-from shared.halts.orders import release
+from shared.halts.orders import order
 from shared.keys import HALT, OBSERVATION
 from shared.messages import PROTOCOL_VERSION, Halts, Observation, Standing
 from shared.place import used
@@ -77,7 +77,7 @@ class Fleet(Rig):
         zero_s = self.first_stop_s(at_s)
         for robot in HANGING:
             self.signal(robot, signal.SIGCONT)
-        self.wait(lambda: release(self.bus, "estop", "", lambda _: None), "released")
+        self.wait(lambda: order(self.bus, "clear", "", lambda _: None), "released")
         return stands_s, zero_s
 
 
@@ -129,7 +129,7 @@ def _key(person: Terminal, bus: Bus, inbox: Inbox, heard: queue.Queue[float]) ->
     person.press(b" ")
     seconds = heard.get(timeout=PATIENCE_S) - at_s
     person.shown()
-    wait_until(lambda: release(bus, "estop", "", lambda _: None), PATIENCE_S, "released")
+    wait_until(lambda: order(bus, "clear", "", lambda _: None), PATIENCE_S, "released")
     return seconds
 
 

@@ -120,8 +120,7 @@ class Bus:
         """Receive the messages of one sender of a `latest` stream, or of all (`*`).
 
         `receive` takes sender and bytes of a message; None and no bytes where the key is of no
-        sender or the message too large. It runs on Zenoh's own thread, one change of threads nearer
-        to who waits for the message: it must only enqueue.
+        sender or the message too large. It runs on Zenoh's own thread: it must only enqueue.
         """
         key = stream.wildcard(self.run) if ident == "*" else stream.key(self.run, ident)
 
@@ -139,7 +138,7 @@ class Bus:
         """Receive the requests of a `request` stream, of one id or of all (`*`).
 
         `receive` must only enqueue. A request must name the concrete key: an answer to a wildcard
-        could not be told from those of others.
+        could be anybody's.
         """
         key = stream.wildcard(self.run) if ident == "*" else stream.key(self.run, ident)
 
@@ -173,10 +172,7 @@ class Bus:
         ident: str = "main",
         timeout_s: float | None = None,
     ) -> M:
-        """Ask once and return the one answer.
-
-        Raises PeerMissing, PeerSilent, PeerRefused or BadMessage; asking again is up to the caller.
-        """
+        """Ask once for one answer. Raises PeerMissing, PeerSilent, PeerRefused or BadMessage."""
         return next(iter(self.request_many(stream, message, cls, ident=ident, timeout_s=timeout_s)))
 
     def request_many(
@@ -229,11 +225,7 @@ class Bus:
         ident: str = "main",
         timeout_s: float,
     ) -> None:
-        """Ask every other life that serves a stream, without waiting.
-
-        `receive` takes the bytes of each answer, on a thread of Zenoh: it must only enqueue.
-        Whoever refuses has not answered.
-        """
+        """Ask every other life that serves a stream. `receive` must only enqueue bytes."""
 
         def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None and len(reply.ok.payload) <= REPLY_LIMIT:
@@ -320,8 +312,7 @@ def open_router(
     """Be a Zenoh router while the block runs; yields the locator it listens on.
 
     endpoint: such as `tcp/127.0.0.1:7447`; port 0 takes a free one. file: configuration with
-    certificates and allow-lists; None: open to everybody. Raises ConfigError when it cannot listen
-    there, for instance because the port is in use.
+    certificates and allow-lists; None: open to everybody. Raises ConfigError if it cannot listen.
     """
     try:
         if file is None:

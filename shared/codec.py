@@ -25,11 +25,7 @@ def encode(message: Message) -> bytes:
 
 
 def decode(data: bytes, *types: type[M]) -> M:
-    """The message in `data`, which must be one of `types`.
-
-    Raises BadMessage for anything that is not msgpack, not a map, of another protocol version, of
-    another type, or with missing, unknown or badly typed fields.
-    """
+    """The message in `data`, which must be one of `types`. Raises BadMessage for anything else."""
     expected = " or ".join(t.__name__ for t in types)
     try:
         fields = _unpacked(data)
@@ -54,11 +50,7 @@ def decode(data: bytes, *types: type[M]) -> M:
 
 
 def _unpacked(data: bytes) -> Any:
-    """What msgpack makes of the bytes. It takes little more memory than they do, or raises.
-
-    A byte may stand for an empty map of 64 bytes: values are counted as their containers close, and
-    the open ones are few, because msgpack bounds their depth.
-    """
+    """What msgpack makes of the bytes. Values are counted: a byte may stand for a map of 64."""
     left = MAX_VALUES
 
     def count(container: Any) -> Any:

@@ -7,10 +7,7 @@ PERIOD_S = 60.0
 
 
 class Complaints:
-    """What one thread complains of. Kinds come from the code, never from a message: they are few.
-
-    `say` writes a line, such as a logger's `warning`; `clock` tells seconds.
-    """
+    """What one thread complains of. `say` writes a line. Kinds come from the code: they are few."""
 
     def __init__(
         self, say: Callable[[str], None], clock: Callable[[], float] = time.monotonic

@@ -1,9 +1,8 @@
 """The one configuration tree: sections, defaults, ranges and units.
 
-Every service gets the same tree and hands each part only its section. How values from presets,
-environment and command line are merged into it, and how a wrong one is reported, is the business
-of `shared.settings`. Cited constants come from the thesis (A.., Eq ..) and the readings of its
-errata (E..), see docs/algorithm.md.
+How values are merged into it, and how a wrong one is reported, is the business of
+`shared.settings`. Cited constants come from the thesis (A.., Eq ..) and the readings of its errata
+(E..), see docs/algorithm.md.
 """
 
 import hashlib

@@ -1,8 +1,4 @@
-"""Facts that everything else follows from: the image, the actions, the pattern of names.
-
-Each stands here once. Whatever can be derived from them (number of outputs, of quotas, size of a
-message) is derived. This file imports nothing of ours and needs the standard library only.
-"""
+"""Facts that everything else follows from: the image, the actions, the pattern of names."""
 
 import re
 from typing import Literal, NamedTuple, get_args

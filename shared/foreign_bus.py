@@ -1,9 +1,7 @@
 """Zenoh sessions with others than our services: raw keys and bytes, such as a robot's ROS 2.
 
-A robot's network has its own router, keys without a run's name and payloads of other people, so
-nothing of `bus.py` but the closed configuration fits. The rules are the same: callbacks only put
-bytes into bounded places of an inbox, the one thread that owns the inbox decodes and acts, and
-what is not taken is counted.
+The rules are those of `bus.py`: callbacks only put bytes into bounded places of an inbox, the one
+thread that owns the inbox decodes and acts, and what is not taken is counted.
 """
 
 import re
@@ -85,8 +83,6 @@ class RawInbox(Arrivals):
         with self._ready:
             return frozenset(self._tokens)
 
-    # ------------------------------------------------------------ called by Zenoh's threads
-
     def put_sample(self, name: str, sample: zenoh.Sample, keep: int, max_bytes: int) -> None:
         """Keep a sample; of a full place the oldest goes: by design with one, else counted."""
         attachment = sample.attachment
@@ -167,9 +163,8 @@ Undeclare = Callable[[], None]
 class ForeignBus:
     """One session with a foreign network. Close it: an unclosed session never exits.
 
-    As a client it connects to `endpoint`, again whenever the router comes back, and raises
-    RouterMissing when none answers within about a second. As a router it listens there; raises
-    ConfigError when it cannot.
+    A client connects to `endpoint`, again whenever the router comes back; raises RouterMissing when
+    none answers within about a second. A router listens there; raises ConfigError when it cannot.
     """
 
     def __init__(self, endpoint: str, mode: Literal["client", "router"] = "client") -> None:

@@ -1,8 +1,4 @@
-"""Keeps messages for one thread, in bounded places, until it takes them.
-
-The bus's threads only put bytes in. The one thread that owns the inbox decodes and acts.
-Undecodable, oversized and overflowing messages are counted by stream.
-"""
+"""Keeps messages in bounded places for the one thread that owns them, decodes and acts."""
 
 from __future__ import annotations
 
@@ -181,16 +177,6 @@ class Inbox(Arrivals):
                     request.refuse(f"bad message: {error}", final=True)
                 continue
             yield request
-
-    @property
-    def refused_total(self) -> int:
-        """All messages so far that were not taken because of what they are."""
-        return sum(self.refused.values())
-
-    @property
-    def busy_total(self) -> int:
-        """All messages so far that were not taken because there was no room."""
-        return sum(self.busy.values())
 
     def _refuse(self, stream: Stream, error: BadMessage) -> None:
         with self._ready:

@@ -1,8 +1,7 @@
 """The one table of streams: key, message types, who sends, who receives, how it is delivered.
 
 Keys start with the run name, then the sender (`<run>/robot/<robot>/observation`), so that two runs
-never mix and allow-lists per role stay short. `docs/protocol.md` is checked against this table by
-a test. There are two kinds of delivery and no third:
+never mix and allow-lists per role stay short. There are two kinds of delivery and no third:
 
 latest   published. The receiver holds one message per key, and a newer one replaces an unread
          older one. The next heartbeat or a repetition replaces a lost message.
@@ -31,17 +30,14 @@ ALL: tuple[Role, ...] = (*SERVING, *LOOKING)
 
 @dataclass(frozen=True)
 class Stream:
-    """One row of the table.
-
-    pattern holds `{run}` and, where several of a kind may exist, `{id}`. `request` is the type a
-    published stream carries, or the type of a request's payload; `reply` the type of its answers.
-    """
+    """One row of the table. Its pattern holds `{run}` and, where several may exist, `{id}`."""
 
     name: str
     pattern: str
-    delivery: Literal["latest", "request"]
     request: type[m.Message]
+    """What is published, or the payload of a request."""
     reply: tuple[type[m.Message], ...]
+    """Types of the answers; empty: it is published."""
     senders: tuple[Role, ...]
     """Who publishes or asks."""
     receivers: tuple[Role, ...]
@@ -49,9 +45,13 @@ class Stream:
     rate: str
     max_bytes: int
     """Larger payloads are refused before they are decoded (of a request or a publication)."""
-    queue: int
+    queue: int = 1
     """Bound of the receiver's queue: 1 for latest."""
-    overflow: str
+
+    @property
+    def delivery(self) -> Literal["latest", "request"]:
+        """How it is delivered."""
+        return "request" if self.reply else "latest"
 
     def key(self, run: str, ident: str = "") -> str:
         """The concrete key. Raises ValueError for a name that could widen the key."""
@@ -90,67 +90,31 @@ def check_sender(stream: Stream, ident: str, message: m.Message) -> None:
         )
 
 
-NEWEST = "newer replaces unread older"
-BUSY = "error reply 'busy', the sender repeats it"
-
-
-def _latest(
-    name: str,
-    pattern: str,
-    message: type[m.Message],
-    senders: tuple[Role, ...],
-    receivers: tuple[Role, ...],
-    rate: str,
-    max_bytes: int,
-) -> Stream:
-    """A row of the first table below."""
-    return Stream(
-        name, pattern, "latest", message, (), senders, receivers, rate, max_bytes, 1, NEWEST
-    )
-
-
-def _request(
-    name: str,
-    pattern: str,
-    request: type[m.Message],
-    reply: tuple[type[m.Message], ...],
-    senders: tuple[Role, ...],
-    receivers: tuple[Role, ...],
-    rate: str,
-    max_bytes: int,
-    queue: int,
-) -> Stream:
-    """A row of the second table below."""
-    return Stream(
-        name, pattern, "request", request, reply, senders, receivers, rate, max_bytes, queue, BUSY
-    )
-
-
 # fmt: off
 # Published: the receiver holds the newest of each key.
-#                       name             key                             message         from          to                              rate                                                 at most
-OBSERVATION   = _latest("observation",   "{run}/robot/{id}/observation", m.Observation,  ("driver",),  ("actor", *LOOKING),            "one per action",                                    8 * KIB)
-ACTION        = _latest("action",        "{run}/actor/{id}/action",      m.Action,       ("actor",),   ("driver", *LOOKING),           "one per observation",                               2 * KIB)
-TAKEOVER      = _latest("takeover",      "{run}/takeover/{id}",          m.Takeover,     ("operator",), ("actor",),                    "10 Hz while a person drives",                       1 * KIB)
-ROBOT_STATE   = _latest("robot_state",   "{run}/robot/{id}/state",       m.RobotState,   ("driver",),  LOOKING,                        "1 Hz",                                              4 * KIB)
-ACTOR_STATE   = _latest("actor_state",   "{run}/actor/{id}/state",       m.ActorState,   ("actor",),   LOOKING,                        "1 Hz",                                              4 * KIB)
-REPLAY_STATE  = _latest("replay_state",  "{run}/replay/main/state",      m.ReplayState,  ("replay",),  ("learner", "actor", *LOOKING), "1 Hz and at every turn",                            4 * KIB)
-LEARNER_STATE = _latest("learner_state", "{run}/learner/main/state",     m.LearnerState, ("learner",), ("actor", "replay", *LOOKING),  "1 Hz, 4 Hz while training, and at every turn done", 4 * KIB)
+#                      name             key                             message          none from         to                               rate                                                 at most
+OBSERVATION   = Stream("observation",   "{run}/robot/{id}/observation", m.Observation,   (), ("driver",),  ("actor", *LOOKING),            "one per action",                                    8 * KIB)
+ACTION        = Stream("action",        "{run}/actor/{id}/action",      m.Action,        (), ("actor",),   ("driver", *LOOKING),           "one per observation",                               2 * KIB)
+TAKEOVER      = Stream("takeover",      "{run}/takeover/{id}",          m.Takeover,      (), ("operator",), ("actor",),                    "10 Hz while a person drives",                       1 * KIB)
+ROBOT_STATE   = Stream("robot_state",   "{run}/robot/{id}/state",       m.RobotState,    (), ("driver",),  LOOKING,                        "1 Hz",                                              4 * KIB)
+ACTOR_STATE   = Stream("actor_state",   "{run}/actor/{id}/state",       m.ActorState,    (), ("actor",),   LOOKING,                        "1 Hz",                                              4 * KIB)
+REPLAY_STATE  = Stream("replay_state",  "{run}/replay/main/state",      m.ReplayState,   (), ("replay",),  ("learner", "actor", *LOOKING), "1 Hz and at every turn",                            4 * KIB)
+LEARNER_STATE = Stream("learner_state", "{run}/learner/main/state",     m.LearnerState,  (), ("learner",), ("actor", "replay", *LOOKING),  "1 Hz, 4 Hz while training, and at every turn done", 4 * KIB)
 
 # Asked for and answered.
-#                       name            key                               request             answers                from (asks)                    to (answers)  rate                              at most   queue
-HALT         = _request("halt",         "{run}/halt",                     m.Halts,            (m.Standing,),         (*SERVING, "operator"),        SERVING,      "until all stand, then 1 Hz",     8 * KIB,  64)
-RELEASE      = _request("release",      "{run}/release",                  m.Release,          (m.Standing,),         ("operator",),                 SERVING,      "rare",                           16 * KIB, 16)
-ROBOT_WORLD  = _request("robot_world",  "{run}/robot/{id}/world",         m.WorldChange,      (m.WorldChanged,),     ("operator",),                 ("driver",),  "rare",                           1 * KIB,  16)
-EPISODE      = _request("episode",      "{run}/replay/main/episode/{id}", m.Episode,          (m.EpisodeAck,),       ("actor",),                    ("replay",),  "one per episode",                24 * MIB, 16)
-PROGRESS     = _request("progress",     "{run}/replay/main/progress/{id}", m.ProgressRequest, (m.RobotProgress,),    ("actor",),                    ("replay",),  "at start",                       1 * KIB,  16)
-TURNS        = _request("turns",        "{run}/replay/main/turns",        m.TurnsRequest,     (m.Turns,),            ("learner",),                  ("replay",),  "one per turn",                   1 * KIB,  16)
-CHANGES      = _request("changes",      "{run}/replay/main/changes",      m.ChangesRequest,   (m.Change, m.FeedEnd), ("learner",),                  ("replay",),  "one per turn",                   1 * KIB,  4)
-SNAPSHOT     = _request("snapshot",     "{run}/replay/main/snapshot",     m.SnapshotRequest,  (m.Change, m.FeedEnd), ("learner",),                  ("replay",),  "at start and after a gap",       1 * KIB,  4)
-MINI_BATCH   = _request("mini_batch",   "{run}/replay/main/mini_batch",   m.MiniBatchRequest, (m.Change,),           ("learner",),                  ("replay",),  "any",                            1 * KIB,  4)
-WEIGHTS      = _request("weights",      "{run}/learner/main/weights",     m.WeightsRequest,   (m.Weights,),          ("actor", "replay", *LOOKING), ("learner",), "one per version",                1 * KIB,  16)
-PING         = _request("ping",         "{run}/service/{id}/ping",        m.Ping,             (m.ServiceReply,),     ALL,                           SERVING,      "rare",                           1 * KIB,  16)
-STOP         = _request("stop",         "{run}/service/{id}/stop",        m.StopService,      (m.ServiceReply,),     ("operator",),                 SERVING,      "rare",                           1 * KIB,  16)
+#                     name            key                               request             answers                from (asks)                    to (answers)  rate                              at most   queue
+HALT         = Stream("halt",         "{run}/halt",                     m.Halts,            (m.Standing,),         (*SERVING, "operator"),        SERVING,      "until all stand, then 1 Hz",     8 * KIB,  64)
+RELEASE      = Stream("release",      "{run}/release",                  m.Release,          (m.Standing,),         ("operator",),                 SERVING,      "rare",                           16 * KIB, 16)
+ROBOT_WORLD  = Stream("robot_world",  "{run}/robot/{id}/world",         m.WorldChange,      (m.WorldChanged,),     ("operator",),                 ("driver",),  "rare",                           1 * KIB,  16)
+EPISODE      = Stream("episode",      "{run}/replay/main/episode/{id}", m.Episode,          (m.EpisodeAck,),       ("actor",),                    ("replay",),  "one per episode",                24 * MIB, 16)
+PROGRESS     = Stream("progress",     "{run}/replay/main/progress/{id}", m.ProgressRequest, (m.RobotProgress,),    ("actor",),                    ("replay",),  "at start",                       1 * KIB,  16)
+TURNS        = Stream("turns",        "{run}/replay/main/turns",        m.TurnsRequest,     (m.Turns,),            ("learner",),                  ("replay",),  "one per turn",                   1 * KIB,  16)
+CHANGES      = Stream("changes",      "{run}/replay/main/changes",      m.ChangesRequest,   (m.Change, m.FeedEnd), ("learner",),                  ("replay",),  "one per turn",                   1 * KIB,  4)
+SNAPSHOT     = Stream("snapshot",     "{run}/replay/main/snapshot",     m.SnapshotRequest,  (m.Change, m.FeedEnd), ("learner",),                  ("replay",),  "at start and after a gap",       1 * KIB,  4)
+MINI_BATCH   = Stream("mini_batch",   "{run}/replay/main/mini_batch",   m.MiniBatchRequest, (m.Change,),           ("learner",),                  ("replay",),  "any",                            1 * KIB,  4)
+WEIGHTS      = Stream("weights",      "{run}/learner/main/weights",     m.WeightsRequest,   (m.Weights,),          ("actor", "replay", *LOOKING), ("learner",), "one per version",                1 * KIB,  16)
+PING         = Stream("ping",         "{run}/service/{id}/ping",        m.Ping,             (m.ServiceReply,),     ALL,                           SERVING,      "rare",                           1 * KIB,  16)
+STOP         = Stream("stop",         "{run}/service/{id}/stop",        m.StopService,      (m.ServiceReply,),     ("operator",),                 SERVING,      "rare",                           1 * KIB,  16)
 
 STREAMS: tuple[Stream, ...] = (
     OBSERVATION, ACTION, TAKEOVER, HALT, RELEASE, ROBOT_STATE, ROBOT_WORLD, ACTOR_STATE,

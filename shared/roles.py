@@ -1,10 +1,9 @@
 """One process for each role: (run, service, id) belongs to one process at a time.
 
-On one machine the lock on a file of the run folder decides, which the kernel lets go of when its
-process ends. Between machines a claim on the bus decides: a process first announces that it wants
-the role, then looks. It goes on only if nobody holds the role; of several who want it at the same
-time the lowest life gets it. The one that looks second always sees the one that announced first,
-so two never go on. A holder that is gone, or frozen, loses the role with its lease. A holder that
+On one machine the lock on a file of the run folder decides. Between machines a claim on the bus
+decides: a process first announces that it wants the role, then looks, and goes on only if nobody
+holds it; of several who want it the lowest life gets it. The one that looks second always sees the
+one that announced first. A holder that is gone, or frozen, loses the role with its lease. One that
 was cut off when another one looked is not seen: of two that meet afterwards the older one stays.
 """
 

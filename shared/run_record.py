@@ -4,9 +4,8 @@
     episodes.csv    one row for each counted episode
     training.csv    one row for each turn of the learner service
 
-An experiment knows everything about an episode at once and writes one table. Of the services,
-replay writes `episodes.csv` without the columns that only the learner knows; those stand in
-`training.csv` and are joined by episode as a run is read.
+An experiment writes one table. Of the services, replay writes `episodes.csv` without the columns
+that only the learner knows; those of `training.csv` are joined by episode as a run is read.
 """
 
 from __future__ import annotations
@@ -253,10 +252,10 @@ def _lines(columns: tuple[str, ...], rows: Iterable[Row]) -> bytes:
 
 
 def read_csv(path: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
-    """All rows of a table; none where there is no file.
+    """All rows of a table without a torn last line; none where there is no file.
 
-    A torn last line is left out. A column that the table lacks is empty in every row. Raises
-    ValueError for another first column, or one that is not among `columns`.
+    A column that the table lacks is empty. Raises ValueError for another first column, or one that
+    is not among `columns`.
     """
     if not path.exists():
         return []
@@ -270,10 +269,7 @@ def read_csv(path: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
 
 
 def read_episodes(folder: Path) -> list[dict[str, str]]:
-    """All episodes of a run folder, with what the learner service wrote about each.
-
-    Raises ValueError for a table of another schema.
-    """
+    """All episodes of a run folder, with what the learner wrote about each. Raises ValueError."""
     training = {row["episode"]: row for row in read_csv(folder / TRAINING, TRAINING_COLUMNS)}
     episodes = read_csv(folder / EPISODES, EPISODE_COLUMNS)
     return [row | training.get(row["episode"], {}) for row in episodes]

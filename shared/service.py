@@ -79,7 +79,20 @@ class Service:
         Raises RoleTaken naming who has the role, or ConfigError naming the first peer that differs.
         """
         with roles.claimed(self.bus, self.name, self.ident, self.life):
-            self._meet_others()
+            fingerprint = self.config.fingerprint()
+            for peer in self.bus.peers():
+                if peer.protocol != str(PROTOCOL_VERSION):
+                    raise ConfigError(
+                        f"{self.name}: speaks protocol {PROTOCOL_VERSION}, but {peer.service} "
+                        f"{peer.id!r} of run {self.config.run.name!r} speaks {peer.protocol}"
+                    )
+                if peer.config != fingerprint:
+                    raise ConfigError(
+                        f"{self.name}: has configuration {fingerprint}, but {peer.service} "
+                        f"{peer.id!r} of run {self.config.run.name!r} has {peer.config}: start "
+                        "both from one file"
+                    )
+            self._announce(self.ident)
 
     def take_role(self, ident: str) -> None:
         """Win another role of this service as well. Raises RoleTaken naming who has it."""
@@ -95,21 +108,6 @@ class Service:
     def _announce(self, ident: str) -> None:
         fingerprint = self.config.fingerprint()
         self.bus.announce(self.name, ident, self.life, PROTOCOL_VERSION, fingerprint)
-
-    def _meet_others(self) -> None:
-        fingerprint = self.config.fingerprint()
-        for peer in self.bus.peers():
-            if peer.protocol != str(PROTOCOL_VERSION):
-                raise ConfigError(
-                    f"{self.name}: speaks protocol {PROTOCOL_VERSION}, but {peer.service} "
-                    f"{peer.id!r} of run {self.config.run.name!r} speaks {peer.protocol}"
-                )
-            if peer.config != fingerprint:
-                raise ConfigError(
-                    f"{self.name}: has configuration {fingerprint}, but {peer.service} {peer.id!r} "
-                    f"of run {self.config.run.name!r} has {peer.config}: start both from one file"
-                )
-        self._announce(self.ident)
 
     def serve_control(self) -> None:
         """Answer `ping` and `stop`, and watch over the role (runs in a thread of its own)."""
@@ -165,9 +163,7 @@ class Service:
     def insist(self, what: str, attempt: Callable[[], T], *, refusals: int = 0) -> T:
         """Repeat a request until it is answered, or a write until there is room; log long waits.
 
-        refusals: how many refusals for good end it, since one may be a message gone astray or a
-            lie; 0: none does, for a request that is always right.
-
+        refusals: how many refusals for good end it; 0: none does, as the request is always right.
         Raises Stopped, and PeerRefused after so many refusals.
         """
         start_s, next_report_s = time.monotonic(), 5.0
@@ -194,11 +190,7 @@ _held: list[int] = []
 
 @contextmanager
 def starting() -> Iterator[None]:
-    """Hold SIGTERM back until `answer_signals`.
-
-    A service asked to stop while it builds its world or reads its memory comes to the same clean
-    end as later.
-    """
+    """Hold SIGTERM back until `answer_signals`: who starts comes to the same clean end as later."""
     _held.clear()
     before = signal.signal(signal.SIGTERM, lambda number, _: _held.append(number))
     try:

@@ -27,13 +27,15 @@ def needing_room(path: Path) -> Iterator[None]:
         raise DiskFull(f"disk full: {path}") from error
 
 
-def write_atomically(path: Path, data: bytes) -> None:
+def write_atomically(path: Path, data: bytes, mode: int = 0o666) -> None:
     """Write a file so that after a kill or power cut it is either the old or the new one."""
     beside = path.with_name(path.name + ".new")
     with needing_room(path):
         path.parent.mkdir(parents=True, exist_ok=True)
+        beside.unlink(missing_ok=True)
         try:
-            with beside.open("wb") as file:
+            handle = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+            with os.fdopen(handle, "wb") as file:
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())
@@ -66,10 +68,9 @@ def save(path: Path, state: dict[str, Any]) -> None:
 
 
 def take(path: Path) -> dict[str, Any] | None:
-    """Read saved values and remove the file: whoever is killed later must not come back to them.
+    """Read saved values and remove the file for good: whoever is killed must not come back to them.
 
-    The file is gone for good when this returns. Returns None when there is none. Raises StateError
-    when it is damaged; it is set aside then.
+    Returns None when there is none. Raises StateError when it is damaged; it is set aside then.
     """
     state = read(path)
     if state is not None:
@@ -79,10 +80,7 @@ def take(path: Path) -> dict[str, Any] | None:
 
 
 def read(path: Path) -> dict[str, Any] | None:
-    """Read saved values and leave them there.
-
-    Returns None when there is no file. Raises StateError when it is damaged; it is set aside then.
-    """
+    """Read saved values and leave them there; None when there is no file. Raises like `take`."""
     try:
         if path.stat().st_size > LIMIT_BYTES:
             raise ValueError(f"expected at most {LIMIT_BYTES} bytes")

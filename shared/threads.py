@@ -99,10 +99,7 @@ def paced(items: Iterable[T], patience_s: float, give_up: Callable[[], None]) ->
 
 @contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
-    """An event that Ctrl-C, SIGTERM and a closed terminal set; handlers are put back at the end.
-
-    Where a closed terminal is ignored already, as under nohup, it stays ignored.
-    """
+    """An event that Ctrl-C, SIGTERM and, but for nohup, a closed terminal set in the block."""
     stop = threading.Event()
     numbers = [signal.SIGINT, signal.SIGTERM]
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import threading
 import time
@@ -14,7 +15,7 @@ from shared.complaints import Complaints
 from shared.errors import BadMessage, BusError, PeerSilent
 from shared.keys import LEARNER_STATE, WEIGHTS
 from shared.messages import LearnerState, Weights, WeightsRequest
-from shared.rl.network import MAX_WEIGHT_BYTES, QNetwork, WeightsHash, checked
+from shared.rl.network import MAX_WEIGHT_BYTES, QNetwork, checked
 from shared.service import TICK_S, Service, Stopped
 
 if TYPE_CHECKING:
@@ -37,16 +38,13 @@ def parts(version: int, data: bytes, digest: str) -> Iterator[Weights]:
 
 
 def fetch(bus: Bus, *, everybody: bool = False) -> tuple[int, bytes]:
-    """The newest version and its safetensors bytes. Raises BusError or BadMessage.
-
-    everybody: ask all who serve weights, in place of the one that the router chooses.
-    """
-    received, digest, size = [], WeightsHash(), 0
+    """The newest version and its safetensors bytes. Raises BusError or BadMessage."""
+    received, digest, size = [], hashlib.sha256(), 0
     replies = bus.request_many(
         WEIGHTS, WeightsRequest(), Weights, patience_s=PATIENCE_S, everybody=everybody
     )
     for message in replies:
-        digest.add(message.data)  # while the next part is on its way
+        digest.update(message.data)  # while the next part is on its way
         received.append(message)
         size += len(message.data)
         if everybody and len(received) == message.parts:
@@ -56,17 +54,13 @@ def fetch(bus: Bus, *, everybody: bool = False) -> tuple[int, bytes]:
     first = received[0]
     if [m.part for m in received] != list(range(first.parts)):
         raise PeerSilent(f"weights: expected {first.parts} parts, got {len(received)}")
-    if {(m.version, m.hash) for m in received} != {(first.version, digest.text)}:
+    if {(m.version, m.hash) for m in received} != {(first.version, digest.hexdigest()[:16])}:
         raise BadMessage(f"weights: parts of version {first.version} do not match their hash")
     return first.version, b"".join(message.data for message in received)
 
 
 class Wanted:
-    """Which version to ask for, and when: as the newest announcement says, true or not.
-
-    A version that was never made must not keep a true one away. What is announced and yet does not
-    come is asked for ever more rarely.
-    """
+    """Which version to ask for, and when: ever more rarely for what is announced and not there."""
 
     def __init__(self) -> None:
         self.version = 1
@@ -92,8 +86,7 @@ class Wanted:
 class WeightsFetcher(threading.Thread):
     """Holds the newest target network; a learner that does not answer holds up nobody.
 
-    What does not fit the run's network is refused: the weights before it stay. `notify` is called
-    whenever there is a newer version (from this thread).
+    What does not fit the network is refused. `notify` is called from this thread for a newer one.
     """
 
     def __init__(self, me: Service, notify: Callable[[], None]) -> None:

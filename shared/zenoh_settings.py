@@ -19,10 +19,7 @@ def zenoh_config(
     shared_memory: bool = False,
     credentials: str = "",
 ) -> zenoh.Config:
-    """A closed configuration: no scouting, explicit endpoints, quick reconnection.
-
-    With a folder of credentials a client encrypts everything and says who it is.
-    """
+    """A closed configuration: no scouting, quick reconnection, encryption with credentials."""
     config = zenoh.Config()
     for key, value in {
         "mode": mode,

@@ -22,6 +22,10 @@ from shared import messages
 from shared.config import Config
 from shared.keys import STREAMS
 
+OVERFLOW = {
+    "latest": "newer replaces unread older",
+    "request": "error reply 'busy', the sender repeats it",
+}
 MARK = re.compile(r"(<!-- generated: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -38,7 +42,8 @@ def streams_table() -> str:
         lines.append(
             f"| {s.name} | `{s.pattern}` | {payload} "
             f"| {', '.join(s.senders)} -> {', '.join(s.receivers)} "
-            f"| {s.delivery} | {s.rate} | {_size(s.max_bytes)} | {s.queue} | {s.overflow} |"
+            f"| {s.delivery} | {s.rate} | {_size(s.max_bytes)} | {s.queue} "
+            f"| {OVERFLOW[s.delivery]} |"
         )
     return "\n".join(lines)
 

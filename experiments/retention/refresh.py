@@ -13,10 +13,9 @@ import numpy.typing as npt
 
 from experiments.retention.stream import Stream
 from shared.config import Config, MemoryConfig
-from shared.rl.equalisation import equalised
 from shared.rl.memory import ReplayMemory
 from shared.rl.predictor import Predictor
-from shared.rl.reward import TERMINAL_REWARD
+from shared.rl.reward import TERMINAL_REWARD, equalised
 
 Floats = npt.NDArray[np.float32]
 Way = Literal["none", "blend", "protected", "anchored", "next-value", "better-fits"]

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,7 @@ def save(folder: Path, loop: SingleProcess, extra: dict[str, Any]) -> None:
         )
     state = {
         "schema": SCHEMA,
-        "counters": loop.counters.to_dict(),
+        "counters": asdict(loop.counters),
         "capacity": memory.capacity,
         "kept": memory.kept,
         "actor": loop.actor.state(),

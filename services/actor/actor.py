@@ -14,19 +14,23 @@ from shared.columns import EPISODE
 from shared.config import Config
 from shared.facts import CHOOSERS, HUMAN, Chooser
 from shared.messages import Action, Episode, Observation, RobotProgress, image_array
-from shared.rl.decision import decide
 from shared.rl.episode import Ending, OpenEpisode, Release, Step, stale_steps, with_current_max_q
-from shared.rl.policy import Values
+from shared.rl.policy import Values, decide
 from shared.rl.predictor import Predictor
 from shared.rl.reward import episode_rewards
+
+KEPT = (
+    *("foreign_actions", "actions", "human_actions", "dropped_samples", "dropped_episodes"),
+    *("_unreported_samples", "_unreported_episodes", "_actions_before"),
+)
+"""Counters of an actor that outlive its process."""
 
 
 class Actor:
     """Turns observations of one robot into actions and finished episodes.
 
-    For every observation call `finish` first and, once what it returned is committed, `act`.
-    Between the two the target network may change (only there: all actions of an episode come from
-    one).
+    For every observation call `finish` first and, once what it returned is committed, `act`. The
+    target network may change only between the two: all actions of an episode come from one.
     """
 
     def __init__(self, config: Config, robot: str, life: str, predictor: Predictor) -> None:
@@ -67,9 +71,8 @@ class Actor:
     def begin(self, progress: RobotProgress, observation: Observation) -> None:
         """Start with what replay has of this robot; count what an earlier actor process lost.
 
-        Every executed action after the newest stored sample was gathered by a process that is gone:
-        the driver's numbering tells how many there were. Steps that were restored go on, unless
-        replay has got samples of the robot since: then another process went on with them.
+        The driver's numbering tells how many actions came after the newest stored sample. Steps
+        that were restored go on, unless replay has got samples of the robot since.
         """
         self.progress = progress
         if self._expected is not None:
@@ -95,9 +98,9 @@ class Actor:
     def finish(self, observation: Observation) -> Episode | None:
         """End the open episode if this observation ends it; return what is to be stored.
 
-        None when the episode goes on, or when it ended without releasing a sample. A step whose
-        action the robot did not carry out (a late answer, a contact or a halt first, or another
-        actor's action in its place) is taken back first: it is neither an action nor a sample.
+        A step whose action the robot did not carry out (a late answer, a contact or a halt first,
+        or another actor's action in its place) is taken back first: it is neither an action nor a
+        sample.
         """
         if self._expected is not None and self._expected[0] in observation.earlier:
             self._expected = (observation.life, self._expected[1])
@@ -125,10 +128,7 @@ class Actor:
         self._unreported_samples = self._unreported_episodes = 0
 
     def lose(self, episode: Episode, life: str) -> None:
-        """The last submission was refused for good: its samples are lost, and counted.
-
-        life: under which to go on. Somebody else may have used up the numbers of the one before.
-        """
+        """The last submission was refused for good: count its samples, go on under another life."""
         self.progress = None
         self.life, self.submissions = life, 0
         self._lives.add(life)
@@ -200,12 +200,7 @@ class Actor:
         """Everything a later process needs to continue exactly here, for msgpack."""
         return {
             "lives": sorted(self._lives),
-            "foreign_actions": self.foreign_actions,
-            "actions": self.actions,
-            "human_actions": self.human_actions,
-            "dropped": [self.dropped_samples, self.dropped_episodes],
-            "unreported": [self._unreported_samples, self._unreported_episodes],
-            "actions_before": self._actions_before,
+            **{name: getattr(self, name) for name in KEPT},
             "laps_before": list(self._laps_before),
             "at_boundary": self.at_boundary,
             "expected": list(self._expected) if self._expected else None,
@@ -213,16 +208,10 @@ class Actor:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue, in a life of one's own, from `state()`.
-
-        Raises KeyError, TypeError or ValueError when it is damaged.
-        """
+        """Continue from `state()`. Raises KeyError, TypeError or ValueError when it is damaged."""
         self._lives = {self.life, *map(str, state["lives"])}
-        self.foreign_actions, self.actions = int(state["foreign_actions"]), int(state["actions"])
-        self.human_actions = int(state["human_actions"])
-        self.dropped_samples, self.dropped_episodes = state["dropped"]
-        self._unreported_samples, self._unreported_episodes = state["unreported"]
-        self._actions_before = int(state["actions_before"])
+        for name in KEPT:
+            setattr(self, name, int(state[name]))
         left, right = state["laps_before"]
         self._laps_before = (int(left), int(right))
         self.at_boundary = bool(state["at_boundary"])

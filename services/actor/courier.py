@@ -30,11 +30,7 @@ class Courier:
         self._pool = ThreadPoolExecutor(AT_ONCE, "courier")
 
     def send(self, episode: Episode) -> Future[Delivery]:
-        """Begin to hand over an episode.
-
-        The future raises Stopped when the service stops first, and PeerRefused when replay refuses
-        it for good.
-        """
+        """Begin to hand over an episode. The future raises Stopped, or PeerRefused for good."""
         future = self._pool.submit(self._deliver, episode)
         future.add_done_callback(lambda _: self._notify())
         return future

@@ -14,13 +14,9 @@ HOLDER_SILENT_S = 3.0
 
 
 class Hand:
-    """Who took the robot over keeps it until it is given back.
+    """Who took the robot over keeps it until it is given back; one person drives at a time.
 
-    One person drives at a time. A person who is gone leaves a robot that stands.
-
-    Args:
-        path: A file that is there while the robot is taken over, so that no restart of the actor
-            lets the network drive.
+    path: is there while the robot is taken over, so that no restart lets the network drive.
     """
 
     def __init__(self, path: Path) -> None:
@@ -72,10 +68,9 @@ class Hand:
     def turn(
         self, now_s: float, period_s: float, *, realtime: bool
     ) -> Literal["act", "wait", "hold"]:
-        """What becomes of the newest observation now; act: as `chosen`.
+        """What becomes of the newest observation now; act: as `chosen`, no faster than real time.
 
-        A person drives no faster than real time. A robot that stands already is told to hold only
-        as its period ends: a wish that comes before is not late for this period.
+        A robot that stands is told to hold only as its period ends: a wish before is not late then.
         """
         wish = self.wish(now_s)
         if wish is not None and (realtime or now_s - self._act_s >= period_s):

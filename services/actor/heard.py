@@ -16,10 +16,7 @@ class Newest:
     state: LearnerState | None = None
 
     def note(self, state: LearnerState, lives: Collection[str]) -> bool:
-        """Take over a state, unless it is of none of the lives that have the learner's role.
-
-        Without any token of a learner each is believed. Returns whether this one is.
-        """
+        """Take over a state, unless others have the learner's role; whether it is believed."""
         believed = not lives or state.life in lives
         if believed:
             self.state = state

@@ -118,10 +118,7 @@ class ActorLoop:
 
     @contextmanager
     def _alone(self, robot: str) -> Iterator[None]:
-        """Let what goes wrong with one robot end its session, and nothing else.
-
-        The session begins anew, from what replay has, with the next observation after a while.
-        """
+        """Let what goes wrong with one robot end its session alone, which begins anew later."""
         try:
             yield
         except (CorridorError, ValueError, TypeError, LookupError, ArithmeticError) as error:
@@ -175,5 +172,5 @@ class ActorLoop:
             return
         self._next_beat_s = now_s + self._me.config.bus.heartbeat_s
         for robot, session in self._sessions.items():
-            state = session.heartbeat(self._inbox.refused_total, self._inbox.busy_total)
+            state = session.heartbeat(self._inbox.refused.total(), self._inbox.busy.total())
             self._me.bus.publish(ACTOR_STATE, state, robot)

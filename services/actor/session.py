@@ -42,10 +42,7 @@ class Session:
         courier: Courier,
         lives: Callable[[], Collection[str]],
     ) -> None:
-        """Serve a robot. No two sessions have the same life: under it episodes count from 0.
-
-        lives: which of its driver's lives have the role now.
-        """
+        """Serve a robot. Each session has a life of its own. lives: who has its driver's role."""
         self._me, self._robot, self._path = me, robot, path
         self._newest, self._weights, self._targets = newest, weights, targets
         self._courier, self._served = courier, ServedLife(lives)
@@ -232,8 +229,8 @@ class Session:
     def _finish(self, observation: Observation) -> None:
         """End the open episode if this observation ends it. It needs the weights of the episode.
 
-        Once for each observation, and not before the episode that ended last is handed over and
-        there are weights: `advance` tries again.
+        Once for each observation, and not before the last episode is handed over: `advance` tries
+        again.
         """
         if self._pending is not None or self._finished is observation:
             return
@@ -244,10 +241,7 @@ class Session:
         self._pending, self._finished = self.actor.finish(observation), observation
 
     def _handed_over(self, episode: Episode) -> bool:
-        """Whether the episode is acknowledged: then it is on disk, exactly once. Raises Stopped.
-
-        One that is refused for good is given up, told of and counted: the robot goes on.
-        """
+        """Whether the episode is acknowledged, or refused for good and counted. Raises Stopped."""
         if self._delivery is None:
             self._delivery = self._courier.send(episode)
         if not self._delivery.done():
@@ -296,10 +290,7 @@ class Session:
             self.actor.predictor = self._targets.of(version, data)
 
     def _hold(self, observation: Observation) -> None:
-        """In real time, let the robot stand still for a period; in lockstep it waits anyway.
-
-        Without an answer it would stand still too, but the episode would be interrupted.
-        """
+        """In real time, let the robot stand still for a period, which interrupts no episode."""
         if self._me.config.robot.timing != "realtime":
             return
         self._observation = None

@@ -13,7 +13,7 @@ from typing import Generic
 from services.commander.keyboard import KeyParser, W, Wish
 from shared.bus import Bus
 from shared.errors import ConfigError, PeerMissing
-from shared.halts.orders import halt
+from shared.halts.orders import order
 
 READ_BYTES = 256
 ESTOP_S = 3.0
@@ -81,6 +81,6 @@ def emergency_stop(bus: Bus, robot: str, echo: Callable[[str], None]) -> None:
     """Tell the driver to stop and stay stopped; meanwhile it hears nothing, and stops, too."""
     stands, until_s = False, time.monotonic() + ESTOP_S
     with suppress(PeerMissing):
-        stands = halt(bus, "estop", robot, echo, ended=lambda: time.monotonic() > until_s)
+        stands = order(bus, "estop", robot, echo, ended=lambda: time.monotonic() > until_s)
     what = "corridor clear releases it" if stands else "no answer, press e again"
     echo(f"{robot}: emergency stop: {what}")

@@ -13,7 +13,7 @@ from shared.bus import Bus
 from shared.config import Config
 from shared.errors import RouterMissing
 from shared.halts.book import ALL
-from shared.halts.orders import halt
+from shared.halts.orders import order
 
 log = logging.getLogger(__name__)
 LOOK_S = 0.25
@@ -77,7 +77,7 @@ class Watcher:
             return
         tell("sent")
         try:
-            stand = halt(self._bus, "estop", ALL, tell, ended=self._done.is_set)
+            stand = order(self._bus, "estop", ALL, tell, ended=self._done.is_set)
         except Exception as error:  # noqa: BLE001  (whatever it is, the person must see it)
             tell(str(error))
         else:

@@ -1,11 +1,8 @@
 """Checkpoints: both networks, the optimiser and all counters in one file, replaced atomically.
 
 Each state goes to one of two files in turn that are not brought to disk: it survives a kill of the
-process and costs no disk, because a file that is removed soon is never written. `sync` makes the
-newest one the checkpoint. After a crash of the machine the others do not count.
-
-Random state needs no saving: every draw is a function of seed and position (`shared.rl.draws`).
-The checkpoint before the newest is kept beside it, for the case that the newest cannot be read.
+process and costs no disk. `sync` makes the newest one the checkpoint; the one before is kept beside
+it. After a crash of the machine the others do not count.
 """
 
 import json
@@ -48,7 +45,7 @@ def keep(
     """Write the state after `episode`, and return where: it survives a kill, not a power cut.
 
     lineage: of the memory as of that episode; config: what others must know who use the network.
-    Raises FloatingPointError and writes nothing when a number is not finite; raises DiskFull.
+    Raises DiskFull, and FloatingPointError when a number is not finite; nothing is written then.
     """
     header = {
         "schema": SCHEMA,
@@ -94,10 +91,7 @@ def _promote(path: Path, newest: Path) -> None:
 
 
 def read(path: Path, trainer: Trainer, identity: str) -> Place:
-    """Restore the trainer; returns the newest turn done, episode 0 without a checkpoint.
-
-    Raises Damaged when the file cannot be read, StateError when it is of another run.
-    """
+    """Restore the trainer; returns the newest turn done. Raises Damaged or StateError."""
     if not path.exists():
         return Place()
     try:
@@ -118,10 +112,9 @@ def read(path: Path, trainer: Trainer, identity: str) -> Place:
 
 
 def take_up(path: Path, trainer: Trainer, identity: str) -> Place:
-    """Read the learner's own newest state. A checkpoint that cannot be read is set aside.
+    """Read the learner's own newest state. Raises StateError as `read` does.
 
-    Raises StateError as `read` does. After a damaged one the next start goes on from the one
-    before, if there is one.
+    A damaged one is set aside; the next start goes on from the one before, if there is one.
     """
     if _age(path) >= 0:
         sync(path)

@@ -11,10 +11,7 @@ REMEDY = "restore memory and checkpoint of one moment, or move the checkpoint aw
 
 @dataclass(frozen=True)
 class Place:
-    """The newest turn done. A memory is the one it was done with if its lineage there is the same.
-
-    A memory that was restored from a backup goes on with other episodes under the same numbers.
-    """
+    """The newest turn done, and the lineage that the memory had there."""
 
     episode: int = 0
     lineage: str = NO_LINEAGE
@@ -25,10 +22,7 @@ class Place:
         return max(self.episode - 1, 0)
 
     def next_turns(self, turns: Sequence[Turn], checkpoint: object) -> tuple[Turn, ...]:
-        """The turns to do, in order, of replay's answer to what comes after `since`.
-
-        Raises StateError: replay's memory is not the one that the checkpoint was made with.
-        """
+        """The turns to do, of what comes after `since`. Raises StateError: of another memory."""
         if self.episode:
             if not turns or turns[0].episode != self.episode:
                 raise StateError(

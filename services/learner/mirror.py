@@ -30,7 +30,7 @@ class Mirror:
     ) -> None:
         """Bring the mirror to change `number` (beyond it only after a gap: then by snapshot).
 
-        lineage: of the memory as of that change. progress: is called for each part; what it raises
+        lineage: of the memory as of that change. progress: called for each part; what it raises
         ends the transfer. Raises BusError; the mirror then stands at a complete change, or starts
         anew.
         """
@@ -74,21 +74,17 @@ def _received(
     for part in bus.request_many(stream, request, Change, FeedEnd, patience_s=PATIENCE_S):
         progress()
         if isinstance(part, FeedEnd):
-            _check_complete(part, rows, messages)
+            if (part.rows, part.messages) != (rows, messages):
+                raise PeerSilent(
+                    f"transfer incomplete: expected {part.rows} rows in {part.messages} parts, "
+                    f"got {rows} in {messages}"
+                )
             yield part
             return
         assert isinstance(part, Change)
         rows, messages = rows + part.count, messages + 1
         yield part
     raise PeerSilent(f"transfer broke off after {rows} rows in {messages} parts")
-
-
-def _check_complete(end: FeedEnd, rows: int, messages: int) -> None:
-    if (end.rows, end.messages) != (rows, messages):
-        raise PeerSilent(
-            f"transfer incomplete: expected {end.rows} rows in {end.messages} parts, "
-            f"got {rows} in {messages}"
-        )
 
 
 def _take(samples: SampleStore, part: Change) -> None:
@@ -100,10 +96,7 @@ def _take(samples: SampleStore, part: Change) -> None:
 
 
 def apply(samples: SampleStore, part: Change) -> None:
-    """Apply one part of a change to a store of samples.
-
-    Raises KeyError or ValueError when it does not fit the samples.
-    """
+    """Apply one part of a change. Raises KeyError or ValueError when it does not fit."""
     values = columns.CHANGES[part.kind].decode(part)
     if part.kind == "discard":
         samples.remove(values["ids"])
@@ -111,7 +104,6 @@ def apply(samples: SampleStore, part: Change) -> None:
         samples.set_rewards(values["ids"], values["rewards"])
     else:
         rows = np.zeros(len(values["ids"]), MIRROR)
-        rows["id"], rows["action"], rows["reward"] = (
-            values[name] for name in ("ids", "actions", "rewards")
-        )
+        for column, name in (("id", "ids"), ("action", "actions"), ("reward", "rewards")):
+            rows[column] = values[name]
         samples.append(rows, values["images"])

@@ -109,10 +109,7 @@ class LearnerLoop:
             self._me.bus.publish(LEARNER_STATE, self._state())
 
     def _take_over(self, known: int) -> None:
-        """Go on above the versions that others have, after a start without the newest checkpoint.
-
-        They never take an older one.
-        """
+        """Go on above the versions that others have, who never take an older one."""
         own = self._trainer.version
         if self._new and own < known < LAST_TAKEOVER:
             self._trainer.version = known + TAKEOVER
@@ -125,7 +122,9 @@ class LearnerLoop:
     def _catch_up(self) -> None:
         """Do the turns that replay has ready. Raises StateError, Stopped."""
         self._told = None
-        for turn in self._place.next_turns(self._ask_turns(self._place.since), self._path):
+        since = self._place.since
+        turns = self._me.insist("ask replay for turns", lambda: self._turns(since))
+        for turn in self._place.next_turns(turns, self._path):
             try:
                 self._turn(turn)
             except OtherTurn as error:
@@ -133,14 +132,11 @@ class LearnerLoop:
                 self._complaints.tell("turn", str(error))
                 return
 
-    def _ask_turns(self, since: int) -> tuple[Turn, ...]:
-        """Turns after an episode, as replay has them. Raises Stopped."""
-        request = TurnsRequest(since=since)
-        return self._me.insist("ask replay for turns", lambda: self._turns(request)).turns
-
-    def _turns(self, request: TurnsRequest) -> Turns:
+    def _turns(self, since: int, limit: int = 100) -> tuple[Turn, ...]:
+        """Turns after an episode, as replay has them. Raises BusError."""
         self._serve()
-        return self._me.bus.request(TURNS, request, Turns)
+        request = TurnsRequest(since=since, limit=limit)
+        return self._me.bus.request(TURNS, request, Turns).turns
 
     def _turn(self, turn: Turn) -> None:
         """Everything the learner does about one episode (E25). Raises Stopped, OtherTurn."""
@@ -202,8 +198,7 @@ class LearnerLoop:
 
     def _confirm(self, turn: Turn) -> None:
         """Check that replay has a turn as it told. Raises BusError, OtherTurn."""
-        request = TurnsRequest(since=turn.episode - 1, limit=1)
-        if self._me.bus.request(TURNS, request, Turns).turns != (turn,):
+        if self._turns(turn.episode - 1, limit=1) != (turn,):
             raise OtherTurn(f"replay has another turn {turn.episode} than before: asking anew")
 
     def _checked_weights(self) -> bytes:
@@ -222,10 +217,7 @@ class LearnerLoop:
         )
 
     def _learn(self, turn: Turn) -> list[float]:
-        """All mini-batches of this turn, answering requests in between; the losses.
-
-        Raises Stopped.
-        """
+        """All mini-batches of this turn, answering in between; the losses. Raises Stopped."""
         losses = []
         try:
             now = Moment(turn.episode, turn.total_actions, turn.actions)
@@ -271,5 +263,5 @@ class LearnerLoop:
             fits=trainer.fits,
             target_age=self._place.episode - trainer.episode_at_copy,
             resyncs=self._mirror.resyncs,
-            undecodable=self._inbox.refused_total,
+            undecodable=self._inbox.refused.total(),
         )

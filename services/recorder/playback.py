@@ -17,7 +17,7 @@ from services.recorder.reader import Recording
 from shared.config import Config
 from shared.errors import ConfigError, StateError
 from shared.messages import PROTOCOL_VERSION, Action, ImageArray, Observation, image_array
-from shared.rl.decision import decide
+from shared.rl.policy import decide
 from shared.rl.predictor import Predictor
 from shared.rl.preprocess import PREPROCESS_VERSION, preprocess
 

@@ -22,6 +22,7 @@ class Feed:
     def __init__(self, tables: Tables) -> None:
         self._tables = tables
         self._listed: tuple[int, list[int]] | None = None
+        """Insertion numbers after a change, kept for as long as nothing changes."""
 
     def note(self, txn: Txn, number: int, kind: Kind, what: Any, lineage: str) -> None:
         """Write a change. `lineage` is that of the memory before it.
@@ -49,8 +50,7 @@ class Feed:
     def changes(self, since: int, upto: int, lineage: str) -> Iterator[Change | FeedEnd]:
         """Yield all changes in (since, upto] in parts of about 1 MB, then a `FeedEnd`.
 
-        lineage: that of the mirror at `since`. With another one it is the mirror of another memory,
-        and no change fits it.
+        lineage: that of the mirror at `since`; no change fits the mirror of another memory.
         """
         with self._tables.env.begin() as txn:
             newest = self._tables.position(txn)
@@ -82,7 +82,9 @@ class Feed:
         """Return at most `size` samples without replacement, drawn by rank, with their rewards."""
         with self._tables.env.begin() as txn:
             number = self._tables.position(txn).change
-            alive = self._alive_at(txn, number)
+            if self._listed is None or self._listed[0] != number:
+                self._listed = number, self._tables.alive(txn)
+            alive = self._listed[1]
             ranks = draw.choice(len(alive), size=min(size, len(alive)), replace=False)
             ids = sorted(alive[rank] for rank in ranks)
             return self._part(txn, number, ids, last=True, current=True)
@@ -93,12 +95,6 @@ class Feed:
             return newest.lineage
         data = txn.get(key_of(number + 1), db=self._tables.db["changes"])
         return "" if data is None else str(unpack(data)[2])
-
-    def _alive_at(self, txn: Txn, number: int) -> list[int]:
-        """Return the insertion numbers after this change, kept for as long as nothing changes."""
-        if self._listed is None or self._listed[0] != number:
-            self._listed = number, self._tables.alive(txn)
-        return self._listed[1]
 
     def _parts(self, txn: Txn, number: int) -> Iterator[Change]:
         """Yield the parts of a change that `note` wrote."""

@@ -15,9 +15,8 @@ MOST_PAGES = 1024
 def gather_heap() -> None:
     """Let all threads allocate from one heap, large arrays too, and keep what they free.
 
-    Otherwise each thread has its own, in pieces of 64 MB: passes over the memory leave holes there,
-    up to a gigabyte of them, or get every intermediate array as new, zeroed pages, which takes up
-    to half of their time. To be called before there are other threads.
+    Otherwise passes over the memory leave up to a gigabyte of holes, or get every intermediate
+    array as new, zeroed pages, for half of their time. Call it before there are other threads.
     """
     library = ctypes.CDLL(None)
     if hasattr(library, "mallopt"):
@@ -27,11 +26,7 @@ def gather_heap() -> None:
 
 
 class Mapping:
-    """Where LMDB maps its file (elsewhere than on Linux nothing is known and nothing done).
-
-    Whoever reads the whole memory once would hold all its pages from then on, although they stay in
-    the system's cache anyway: as much memory again as the images take.
-    """
+    """Where LMDB maps its file, on Linux: whoever reads all would hold as much memory again."""
 
     def __init__(self, path: Path) -> None:
         self._ranges = _ranges_of(path.resolve())
@@ -39,20 +34,14 @@ class Mapping:
         self._looked_at = 0
 
     def looked_at(self, pages: int) -> None:
-        """Count pages, and let go of all when they are many: getting them again takes time.
-
-        Threads may lose a count to each other: then it happens a little later.
-        """
+        """Count pages, about; let go of all when they are many. Getting them again takes time."""
         self._looked_at += pages
         if self._looked_at >= MOST_PAGES:
             self._looked_at = 0
             self.let_go()
 
     def let_go(self) -> None:
-        """Let go of all pages. Harmless beside readers and writers: they get them again.
-
-        The map is shared and read only; what is written goes to the file, never to these pages.
-        """
+        """Let go of all pages of the read-only map. Harmless: readers get them again."""
         if self._madvise is not None:
             for start, size in self._ranges:
                 advice = ctypes.c_int(mmap.MADV_DONTNEED)

@@ -1,12 +1,8 @@
-"""The numbers replay hands out: commits, global episodes, insertions, and each robot's progress.
-
-Pure: the service keeps `Counters` on disk with the samples they number, the single-process loop
-keeps them in a variable.
-"""
+"""The numbers replay hands out: commits, global episodes, insertions, and each robot's progress."""
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -70,13 +66,9 @@ class Counters:
         """Return the counters with these amounts added."""
         return replace(self, **{name: getattr(self, name) + n for name, n in amounts.items()})
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values that msgpack can write."""
-        return asdict(self)
-
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> "Counters":
-        """Return what `to_dict()` was made of. Raises StateError when it is damaged."""
+        """Return what `asdict` made of them. Raises StateError when it is damaged."""
         try:
             robots = {name: RobotCounters(**robot) for name, robot in values["robots"].items()}
             return cls(**{**values, "robots": robots})
@@ -90,19 +82,12 @@ def filling(counters: Counters, config: MemoryConfig) -> bool:
 
 
 def refill(counters: Counters, config: MemoryConfig, held: int) -> Counters:
-    """The counters as settings change while the memory holds `held` samples.
-
-    A larger memory is filled anew. What it holds counts, so that it ends with exactly N (E44).
-    """
+    """The counters as settings change while the memory holds `held` samples, which count (E44)."""
     return replace(counters, filled=held) if filling(counters, config) else counters
 
 
 def settled(spans: Sequence[Span], last: int) -> list[Span]:
-    """The spans after a submission, the newest last.
-
-    What is far from all of them begins a span of its own: a number that the driver never reached
-    keeps none of its true ones away.
-    """
+    """The spans after a submission, the newest last. What is far from all begins a new one."""
     first = max(last - REACH + 1, 0)
     near = [span for span in spans if first <= span[1] + 1 and span[0] <= last]
     others = [span for span in spans if span not in near]
@@ -114,9 +99,8 @@ def refusal(
 ) -> str:
     """Why a submission can never be accepted as it is, after its kind and a colon; empty if it can.
 
-    spans: what is settled of this robot and `robot_life`. The samples of a submission are of
-    executed actions of one driver life, each sample of another one, so at least as many numbers
-    were used up as there are samples.
+    spans: what is settled of this robot and `robot_life`. Each sample is of another executed
+    action, so at least as many numbers were used up as there are samples.
     """
     known = counters.robots.get(episode.robot)
     if known is None and len(counters.robots) >= MAX_ROBOTS:
@@ -149,8 +133,7 @@ def lineage_after(lineage: str, identity: str, digest: str) -> str:
 def accept(counters: Counters, config: MemoryConfig, episode: Episode) -> tuple[Commit, Counters]:
     """Number a submission: the commit, and the counters after it.
 
-    While filling, what exceeds the capacity is not stored, so that D starts with exactly N samples
-    (A13); fill submissions that come after the end store nothing.
+    While filling, what exceeds the capacity is not stored: D starts with exactly N samples (A13).
     """
     robot = counters.robots.get(episode.robot, RobotCounters())
     if episode.fill:
@@ -191,9 +174,8 @@ def bump_free(run: int, episode: Episode) -> tuple[int, int]:
     """The run that goes on after a submission, and how long it was with it, in actions (E10, E43).
 
     run: actions of the robot without a bump until then. A run excludes the bumping action and spans
-    episodes. A bump ends it at any time, and so does an interruption, of which a change of the
-    world is one. Actions that fill the memory do not count. Neither do those of an episode that was
-    dropped as a whole, which are at most the 50 of the look-ahead.
+    episodes; a bump or an interruption ends it. Actions that fill the memory do not count, nor do
+    those of an episode that was dropped as a whole, at most the 50 of the look-ahead.
     """
     interrupted_before = episode.dropped_episodes > 0
     new = episode.fitness if interrupted_before else episode.actions

@@ -128,10 +128,7 @@ class Intake:
         return self._version
 
     def _exists(self, episode: Episode, now_s: float) -> bool:
-        """Whether the version of an episode may exist, though it is not known: for a while any may.
-
-        After that only what a learner that can be heard now does not contradict.
-        """
+        """Whether the version of an episode may exist, though not known: for a while any may."""
         robot = (episode.robot, episode.weights_version)
         if robot not in self._doubted and len(self._doubted) >= MAX_ROBOTS:
             self._doubted.clear()
@@ -188,7 +185,7 @@ class Intake:
             fitness_mean_100=view.fitness_mean,
             duplicates=self.duplicates,
             refused=self.refused,
-            undecodable=self._inbox.refused_total + self._bulk.refused_total,
+            undecodable=self._inbox.refused.total() + self._bulk.refused.total(),
             **_totals(counters),
         )
 

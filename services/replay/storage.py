@@ -86,10 +86,7 @@ class Storage:
             return int(unpack(cursor.value())["weights_version"]) if cursor.last() else 0
 
     def commit(self, episode: Episode) -> Accepted:
-        """Write one submission, or recognise it as already written; on disk when this returns.
-
-        Raises Refused when it cannot be accepted.
-        """
+        """Write one submission to disk, or know it as written. Raises Refused if it cannot be."""
         identity = f"{episode.robot}/{episode.life}/{episode.number}"
         summary, db = _summary(episode), self._tables.db
         with self._tables.writing() as txn:
@@ -114,7 +111,7 @@ class Storage:
             txn.put(identity.encode(), key_of(commit.commit), db=db["identity"])
             spans = numbering.settled(spans, episode.last_sequence)
             txn.put(driver, b"".join(key_of(n) for span in spans for n in span), db=db["lives"])
-            self._tables.put_meta(txn, "counters", counters.to_dict())
+            self._tables.put_meta(txn, "counters", asdict(counters))
         return Accepted(commit, counters, duplicate=False)
 
     def _lineage(self, txn: Txn, commit: int) -> str:

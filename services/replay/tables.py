@@ -131,15 +131,12 @@ class Tables:
         self._mapping = Mapping(folder / "data.mdb")
 
     def belong_to(self, config: MemoryConfig, identity: str) -> None:
-        """Begin a memory of this run in new files.
-
-        Raises StateError when they belong to another run or schema.
-        """
+        """Begin a memory in new files. Raises StateError when they are of another run or schema."""
         with self.writing() as txn:
             known = self.meta(txn, "identity")
             if known is None:
                 self.put_meta(txn, "identity", [SCHEMA, identity])
-                self.put_meta(txn, "counters", Counters().to_dict())
+                self.put_meta(txn, "counters", asdict(Counters()))
                 start = Position(0, 0, 0, 0, config.capacity)
                 self.put_meta(txn, "position", asdict(start))
                 self.put_meta(txn, "worlds", [])

@@ -1,7 +1,6 @@
 """The thread that owns the replay memory: one turn after the other, away from the serving threads.
 
-It reads committed episodes from disk, waits for the weights they need, appends, discards, equalises
-and applies the result in one transaction. Killed at any moment, it does the turn again.
+It applies each turn in one transaction. Killed at any moment, it does the turn again.
 """
 
 import threading
@@ -76,7 +75,10 @@ class TurnWorker(threading.Thread):
     def run(self) -> None:
         """Work until the service stops."""
         try:
-            memory = self._load()
+            memory = self._storage.load()
+            memory.check_valid()
+            self._restart_metrics()
+            self._show(memory, activity="idle")
             while not self._me.stop.is_set():
                 pending = self._storage.pending(self.view.position.processed)
                 if pending is None:
@@ -87,19 +89,14 @@ class TurnWorker(threading.Thread):
         finally:
             self._metrics.close()
 
-    def _load(self) -> ReplayMemory:
-        memory = self._storage.load()
-        memory.check_valid()
-        self._restart_metrics()
-        self._show(memory, activity="idle")
-        return memory
-
     def _turn(self, memory: ReplayMemory, submission: Submission) -> None:
         """Do everything that replay does about one submission (E25)."""
         commit, record = submission.commit, submission.record
         if commit.episode:
             self._show(memory, activity="waiting")
-            self._await_weights(int(record["weights_version"]))
+            version, data = self.weights.wait_for(int(record["weights_version"]))
+            if version > self._predictor.version:
+                self._predictor.load(version, data)
         self._show(memory, activity="discarding")
         memory.worlds = submission.worlds
         memory.append(submission.rows, submission.images)
@@ -129,12 +126,6 @@ class TurnWorker(threading.Thread):
         if done.discarded.warning:
             self._me.log.warning("episode %d: %s", commit.episode, done.discarded.warning)
         self._show(memory, position=position, activity="idle")
-
-    def _await_weights(self, least: int) -> None:
-        """Have the newest target network, of version `least` or later. Raises Stopped."""
-        version, data = self.weights.wait_for(least)
-        if version > self._predictor.version:
-            self._predictor.load(version, data)
 
     def _progress(self, activity: Activity) -> Callable[[int, int], None]:
         def report(done: int, of: int) -> None:

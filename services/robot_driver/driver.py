@@ -1,7 +1,6 @@
 """The driver of one robot: observations out, actions in, safety always (no bus in here).
 
-The service and the single-process loop both use it. A robot only senses and moves (`robot.py`).
-How it moves is decided in `motion_control.py`; sequence numbers, bumps and commands are here.
+How a robot moves is decided in `motion_control.py`; sequence numbers and bumps are here.
 """
 
 from collections.abc import Collection
@@ -11,7 +10,7 @@ from services.robot_driver.host import Host
 from services.robot_driver.motion_control import MotionControl
 from services.robot_driver.robot import NotReady, Pose, Robot
 from services.robot_driver.safety import Safety
-from services.robot_driver.world_changes import Outcome, WorldChanges, described
+from services.robot_driver.world_changes import WorldChanges, described
 from shared.config import Config
 from shared.messages import (
     MAX_EARLIER,
@@ -27,6 +26,12 @@ from shared.messages import (
     WorldChange,
     WorldChanged,
 )
+
+COUNTS = (
+    *("sequence", "bumps", "recoveries", "late_actions", "refused_actions"),
+    *("resent_observations", "refused_changes", "blocks"),
+)
+"""What a driver counts and tells."""
 
 
 class Driver:
@@ -54,6 +59,10 @@ class Driver:
         self._executed: tuple[int | None, str] = self._begun
         self._pose = Pose(0.0, 0.0, 0.0)
 
+    def attach(self, host: Host) -> None:
+        """Belong to this process from now on."""
+        self._host = self._control.host = host
+
     @property
     def world(self) -> str:
         """Name of the world the robot drives in now."""
@@ -73,9 +82,7 @@ class Driver:
             action=self._executed[0],
             actor_life=self._executed[1],
             image=sensed.image.tobytes(),
-            x_m=sensed.pose.x_m,
-            y_m=sensed.pose.y_m,
-            heading_rad=sensed.pose.heading_rad,
+            **vars(sensed.pose),
             bump=self._bump,
             interruption=self._interruption,
             world=self.world,
@@ -115,28 +122,22 @@ class Driver:
             self.look_again("")
 
     def start_motion(self, motion: Motion) -> bool:
-        """Begin to turn on the spot or to creep, within the limits.
-
-        False: the bumper is pressed, so the robot stands still; nobody knows from which side.
-        """
+        """Begin to turn or to creep; False, standing still, where the bumper is pressed."""
         started = self._control.start_motion(motion)
         if started:
             self.state = "driving"
         return started
 
     def advance(self, duration_s: float) -> bool:
-        """Let time pass; True at contact, where the robot has already stopped.
-
-        With the recovery `none` contact does not stop an action, but it does stop a motion.
-        """
+        """Let time pass; True at contact, which stops the robot (`MotionControl.advance`)."""
         return self._control.advance(duration_s)
 
     def settle(self, bump: bool, *, executed: bool = True) -> None:
         """The action or motion is over: count it, recover from a bump, look anew.
 
         Realtime only: a bump before the newest observation was answered (not `executed`) belongs to
-        the action before it, so the number stays. A motion never counts as an action; after a bump
-        the robot only lets go of what it touched.
+        the action before it, so the number stays. A motion never counts; after its bump the robot
+        lets go.
         """
         self._bump, self._interruption = bump, ""
         self.bumps += int(bump)
@@ -165,8 +166,7 @@ class Driver:
     def block(self, reason: str, *, bump: bool = False) -> None:
         """The robot is not fit to drive: stand still until `fit`, then look anew.
 
-        A bump at that moment is counted and not recovered from: nobody knows when it goes on. It
-        ends the action in force, which counts as executed, before the robot is blocked (E42).
+        A bump at that moment is counted, not recovered from, and ends the action in force (E42).
         """
         if bump and not self._control.motion:
             self._bump, self._interruption = True, ""
@@ -204,10 +204,9 @@ class Driver:
         return safety.halted
 
     def change(self, wish: WorldChange, *, at_once: bool = False) -> WorldChanged:
-        """Take a wish to change the world: it waits for its episode, or is refused.
+        """Take a wish to change the world: it waits for its episode, or is refused, and counted.
 
-        With `at_once`, while the robot waits between actions, what need not wait is carried out now
-        and not instead of the next action. A refusal is counted and told.
+        at_once: what need not wait is carried out now, and not instead of the next action.
         """
         if wish.kind in ("withdraw", "list"):
             return self._rearrange(wish)
@@ -220,14 +219,13 @@ class Driver:
             return self._changes.answer(wish, str(error))
         outcomes = self._carry_out(0) if at_once else []
         self._host.keep(self._changes.kept())
-        refusal = next((outcome.refusal for outcome in outcomes if outcome.change is wish), "")
+        refusal = next((refusal for change, refusal in outcomes if change is wish), "")
         return self._changes.answer(wish, refusal)
 
     def apply_due(self, episode: int) -> bool:
-        """Carry out the changes that are due in this episode of the robot, if any.
+        """Carry out the changes that are due in this episode of the robot, `Action.episode`.
 
-        Call it with `Action.episode` of the action that answers the newest observation. True: do
-        not execute that action, look again instead (same sequence, next attempt).
+        True: do not execute that action, look again instead (same sequence, next attempt).
         """
         outcomes = self._carry_out(episode)
         if outcomes:
@@ -241,53 +239,38 @@ class Driver:
 
     def report(self, undecodable: int, busy: int = 0) -> RobotState:
         """The heartbeat."""
-        laps = self._robot.laps
+        laps, faults = self._robot.laps, self._robot.faults.most_common(MAX_FAULTS)
         return RobotState(
             robot=self._config.robot.id,
             life=self.life,
             state=self.shown_state,
-            sequence=self.sequence,
-            x_m=self._pose.x_m,
-            y_m=self._pose.y_m,
-            heading_rad=self._pose.heading_rad,
+            **{name: getattr(self, name) for name in COUNTS},
+            **vars(self._pose),
             world=self.world,
-            bumps=self.bumps,
-            recoveries=self.recoveries,
             deadman_stops=self.safety.deadman_stops,
             clamped=self.safety.clamped,
-            late_actions=self.late_actions,
-            refused_actions=self.refused_actions,
-            resent_observations=self.resent_observations,
             undecodable=undecodable,
             busy=busy,
             laps_left=laps.left,
             laps_right=laps.right,
             pending_changes=len(self._changes.pending),
-            refused_changes=self.refused_changes,
-            blocks=self.blocks,
             reason=self.reason[:200],
-            faults=self._faults(),
+            faults=tuple(Fault(name=name[:64], count=count) for name, count in faults),
         )
 
     def saved(self) -> dict[str, Any]:
         """Everything a later process needs to continue exactly here, for msgpack."""
-        names = (
-            "sequence attempt bumps recoveries late_actions refused_actions "
-            "resent_observations refused_changes blocks _bump _interruption _executed"
-        )
+        names = (*COUNTS, "attempt", "_bump", "_interruption", "_executed")
         return {
             "kind": self._config.robot.kind,
             "robot": self._robot.state(),
             "changes": self._changes.saved(),
             "lives": [self.life, *self.earlier],
-            **{name: getattr(self, name) for name in names.split()},
+            **{name: getattr(self, name) for name in names},
         }
 
     def restore(self, saved: dict[str, Any]) -> None:
-        """Continue from `saved()`. Raises KeyError, TypeError or ValueError when it does not fit.
-
-        A real robot was not held still meanwhile: what it perceives next tells of a restart.
-        """
+        """Continue from `saved()`. Raises KeyError, TypeError or ValueError on a misfit."""
         if saved.keys() != self.saved().keys():
             odd = sorted(saved.keys() ^ self.saved().keys())
             raise KeyError(f"missing or unknown: {', '.join(odd)}")
@@ -300,10 +283,7 @@ class Driver:
             self.look_again("restart")
 
     def restore_kept(self, kept: dict[str, Any]) -> None:
-        """Begin anew in the world that an earlier, killed driver gave to `Host.keep`.
-
-        Raises KeyError, TypeError or ValueError when it does not fit.
-        """
+        """Begin anew in a world that `Host.keep` got. Raises KeyError, TypeError or ValueError."""
         self._changes.restore_kept(kept)
 
     def _rearrange(self, wish: WorldChange) -> WorldChanged:
@@ -314,16 +294,16 @@ class Driver:
         self._host.keep(self._changes.kept())
         return self._changes.answer(wish, refusal)
 
-    def _carry_out(self, episode: int) -> list[Outcome]:
+    def _carry_out(self, episode: int) -> list[tuple[WorldChange, str]]:
         """Carry out what is due; the robot then stands still and looks again."""
         outcomes = self._changes.carry_out(episode)
         switched = False
-        for outcome in outcomes:
-            if outcome.refusal:
-                self._refused(outcome.change, outcome.refusal)
+        for change, refusal in outcomes:
+            if refusal:
+                self._refused(change, refusal)
             else:
-                switched |= outcome.change.kind == "switch"
-                self._host.tell(f"world: {described(outcome.change)}")
+                switched |= change.kind == "switch"
+                self._host.tell(f"world: {described(change)}")
         if outcomes:
             self.halt()
             self.look_again("world" if switched else "")
@@ -332,10 +312,6 @@ class Driver:
     def _refused(self, change: WorldChange, reason: str) -> None:
         self.refused_changes += 1
         self._host.complain(f"world: refused to {described(change)}: {reason}")
-
-    def _faults(self) -> tuple[Fault, ...]:
-        most = self._robot.faults.most_common(MAX_FAULTS)
-        return tuple(Fault(name=name[:64], count=count) for name, count in most)
 
     def _count(self, *, executed: bool) -> None:
         """Number the next observation: an executed action counts, anything else is a new look."""

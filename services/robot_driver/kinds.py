@@ -32,22 +32,12 @@ REAL = {
 
 
 def make_robot(config: Config) -> Robot:
-    """The robot of this configuration, simulated or real, ready to drive.
-
-    Raises:
-        ConfigError: A world that cannot be used, or a library that is not installed.
-        RobotMissing: The real robot does not answer.
-    """
+    """The robot of this configuration, ready to drive. Raises ConfigError or RobotMissing."""
     return _simulated(config) if config.robot.kind == "sim" else _real(config)
 
 
 def make_link(config: Config) -> Link:
-    """The way to a real robot, not opened yet.
-
-    Raises:
-        ConfigError: It is a simulated one, it cannot be reached like that, or a library is not
-            installed.
-    """
+    """The way to a real robot, not opened yet. Raises ConfigError."""
     if config.robot.kind == "sim":
         raise ConfigError(f"robot.kind: expected a real robot ({', '.join(REAL)}), got 'sim'")
     kind, link = REAL.get(config.robot.kind), None

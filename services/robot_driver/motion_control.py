@@ -36,7 +36,7 @@ class MotionControl:
     """Sets a robot's velocity and stops it: at contact, when halted, when the deadman expires."""
 
     def __init__(self, config: Config, robot: Robot, safety: Safety, host: Host) -> None:
-        self._config, self._robot, self._safety, self._host = config, robot, safety, host
+        self._config, self._robot, self._safety, self.host = config, robot, safety, host
         self._moving = False
         self.motion: Motion = ""
         """The motion in force, or the one just over. It is empty for an action."""
@@ -47,10 +47,7 @@ class MotionControl:
         self._start(action_velocity(self._config, action))
 
     def start_motion(self, motion: Motion) -> bool:
-        """Begin to turn on the spot or to creep.
-
-        False: the bumper is pressed, so the robot stands still; nobody knows from which side.
-        """
+        """Begin to turn or to creep. False, standing still, where the bumper is pressed."""
         if self._robot.feel().contact:
             self.halt()
             return False
@@ -70,7 +67,7 @@ class MotionControl:
         if self._moving and self._safety.halted:
             self._drive(STANDSTILL)
         elif self._moving and self._safety.expired(self._robot.now_s()):
-            self._safety.count_deadman()
+            self._safety.deadman_stops += 1
             self._drive(STANDSTILL)
         return contact
 
@@ -101,12 +98,9 @@ class MotionControl:
 
     @contextmanager
     def _recovering(self) -> Iterator[WatchedRobot]:
-        """A robot that moves by itself, within the limits and watched, until the block ends.
-
-        The block may break off; the robot stands still after it in any case.
-        """
+        """A robot that moves by itself, within the limits and watched, until the block ends."""
         slice_s = SLICE_S if self._config.robot.timing == "realtime" else None
-        watched = WatchedRobot(self._robot, self._safety, self._host, slice_s)
+        watched = WatchedRobot(self._robot, self._safety, self.host, slice_s)
         try:
             yield watched
             if self._config.robot.kind != "sim":  # it still moves when told to stop

@@ -1,7 +1,6 @@
 """What a robot does after a bump (E11): retreat by real motion, then turn on the spot.
 
-It uses nothing but `drive`, `run` and `feel`, so it serves simulated and real robots alike. The
-bumper has one bit for the whole ring: a pressed bumper cannot tell front from rear.
+The bumper has one bit for the whole ring: a pressed bumper cannot tell front from rear.
 """
 
 import math
@@ -65,11 +64,9 @@ LET_GO_M = 0.15
 def back_off(robot: Base, config: RobotConfig, heading_rad: float) -> float:
     """Retreat at most `recovery_distance_m`, then turn on the spot to `heading_rad` (odometry).
 
-    A wall behind ends the retreat; the robot then creeps forward half the way it had won, so that
-    it does not begin its next action against that wall. It does not where the bumper never let go:
-    nobody knows on which side it is pressed. It stands still afterwards.
-
-    Returns the distance between the poses before and after, metres. Raises RobotFault.
+    A wall behind ends the retreat; the robot then creeps forward half the way it had won, unless
+    the bumper never let go. Returns the metres between the poses before and after. Raises
+    RobotFault.
     """
     start = robot.feel().pose
     blocked = _move(robot, config, -config.recovery_distance_m)
@@ -88,9 +85,7 @@ def back_off(robot: Base, config: RobotConfig, heading_rad: float) -> float:
 def let_go(robot: Base, config: RobotConfig, direction: float) -> None:
     """Creep straight until the bumper is free, at most `LET_GO_M`; stand still then.
 
-    The bumper was free before it moved the other way. direction: 1.0 forward, -1.0 backwards.
-
-    Raises RobotFault: the robot cannot be read or commanded.
+    direction: 1.0 forward, -1.0 backwards. Raises RobotFault.
     """
     speed, left = _creeping(config), LET_GO_M
     while left > 0.0 and robot.feel().contact:

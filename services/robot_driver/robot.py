@@ -1,7 +1,6 @@
 """What a driver needs of a robot, real or simulated: the only interface between the two.
 
-Units are SI, angles counter-clockwise, x forward. The driver (`driver.py`) owns safety and time;
-a robot only senses and moves.
+Units are SI, angles counter-clockwise, x forward. The driver (`driver.py`) owns safety and time.
 """
 
 from __future__ import annotations
@@ -102,18 +101,14 @@ class Base(ABC):
 
     @abstractmethod
     def run(self, duration_s: float, *, stop_on_contact: bool) -> bool:
-        """Let `duration_s` pass: simulated, or real while the bumper is watched.
+        """Let `duration_s` pass, with `stop_on_contact` standing from the first contact on, if any.
 
-        Returns whether there was contact at any time. With `stop_on_contact` the velocity becomes
-        zero at the first contact and the rest of the time passes standing still.
+        Returns whether there was contact at any time.
         """
 
 
 class Robot(Base):
-    """A mobile base with one camera and a ring bumper: everything a driver asks of it.
-
-    Laps, faults and a world to change have defaults, for robots that know of none.
-    """
+    """A mobile base with one camera and a ring bumper: everything a driver asks of it."""
 
     @abstractmethod
     def sense(self) -> Sensed:
@@ -156,10 +151,7 @@ class RobotFault(Exception):
 
 
 class NotReady(RobotFault):
-    """The robot must stand still for now: a sensor is stale, its battery low, its bumper stuck.
-
-    The text says why. Once that is over the robot can go on.
-    """
+    """The robot must stand still for now, the text says why: a sensor is stale, its battery low."""
 
     def __init__(self, reason: str, *, contact: bool = False) -> None:
         super().__init__(reason)

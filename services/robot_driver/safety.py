@@ -17,6 +17,7 @@ class Safety:
     paused: bool = False
     clamped: int = 0
     deadman_stops: int = 0
+    """How often a moving robot was stopped because no fresh action came."""
     _fresh_s: float = -math.inf
 
     @property
@@ -25,10 +26,7 @@ class Safety:
         return self.estop or self.paused
 
     def allow(self, wanted: Velocity, now_s: float) -> Velocity:
-        """What of a fresh action's velocity may be driven from `now_s` on.
-
-        Not finite or halted: nothing. Beyond the limits: cut to them and counted.
-        """
+        """What may be driven from `now_s` on, cut to the limits and counted; halted: nothing."""
         parts = (wanted.forward_m_s, wanted.left_m_s, wanted.turn_rad_s)
         if self.halted or not all(math.isfinite(part) for part in parts):
             return STANDSTILL
@@ -48,7 +46,3 @@ class Safety:
     def expired(self, now_s: float) -> bool:
         """Whether the last fresh action is older than the deadman allows."""
         return now_s - self._fresh_s > self.config.deadman_s + 1e-9
-
-    def count_deadman(self) -> None:
-        """A moving robot was stopped because no fresh action came."""
-        self.deadman_stops += 1

@@ -30,13 +30,12 @@ def run(config: Config, folder: Path, life: str) -> None:
     """Drive one robot until stopped; a clean stop saves where it is."""
     own = folder / "robot" / config.robot.id
     robot = make_robot(config)
-    host = ServiceHost(own / WORLD)
-    driver = Driver(config, robot, life, host)
+    driver = Driver(config, robot, life)
     try:
         _restore(driver, own, config.robot.kind)
         # Stopped before it was up, it has driven nothing, but has taken up what was saved.
         with suppress(Stopped), service("driver", config.robot.id, config, life=driver.life) as me:
-            loop = DriverLoop(me, driver, host, folder)
+            loop = DriverLoop(me, driver, folder)
             try:
                 loop.run()
             finally:
@@ -63,47 +62,10 @@ def _restore(driver: Driver, own: Path, kind: str) -> None:
         raise StateError(f"{path}: saved state of the robot does not fit: {error}") from error
 
 
-class ServiceHost(Host):
-    """The service as its driver sees it. It has nothing to look at until its loop exists."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._loop: DriverLoop | None = None
-
-    def attach(self, loop: "DriverLoop") -> None:
-        """Take commands and the end of the service from this loop from now on."""
-        self._loop = loop
-        self._complaints = Complaints(loop.me.log.warning)
-
-    @property
-    def stopping(self) -> bool:
-        """Whether the service is to stop."""
-        return self._loop is not None and self._loop.me.stop.is_set()
-
-    def look(self) -> None:
-        """Answer commands and publish the heartbeat."""
-        if self._loop is not None:
-            self._loop.beat()
-
-    def tell(self, line: str) -> None:
-        """Log what became of a change of the world."""
-        if self._loop is not None:
-            self._loop.me.log.info(line)
-
-    def complain(self, line: str) -> None:
-        """Log the first refusal of a minute."""
-        if self._loop is not None:
-            self._complaints.tell("world", line)
-
-    def keep(self, kept: dict[str, Any]) -> None:
-        """Write the robot's world to disk."""
-        statefile.save(self._path, kept)
-
-
-class DriverLoop:
+class DriverLoop(Host):
     """Publishes observations and executes the actions that answer them."""
 
-    def __init__(self, me: Service, driver: Driver, host: ServiceHost, folder: Path) -> None:
+    def __init__(self, me: Service, driver: Driver, folder: Path) -> None:
         self.me, self._driver, self._config = me, driver, me.config
         self._robot = me.config.robot.id
         self._inbox: Inbox = me.bus.inbox()
@@ -114,7 +76,30 @@ class DriverLoop:
         me.stop.on_set(self._inbox.wake)
         self._next_beat_s, self._heard_s, self._router = 0.0, clock_s(), ""
         self._halts = KeptBook(folder, me.name, me.ident, me.life, self._robot)
-        host.attach(self)
+        self._world = folder / "robot" / self._robot / WORLD
+        self._complaints = Complaints(me.log.warning)
+        driver.attach(self)
+
+    @property
+    def stopping(self) -> bool:
+        """Whether the service is to stop."""
+        return self.me.stop.is_set()
+
+    def look(self) -> None:
+        """Answer commands and publish the heartbeat."""
+        self.beat()
+
+    def tell(self, line: str) -> None:
+        """Log what became of a change of the world."""
+        self.me.log.info(line)
+
+    def complain(self, line: str) -> None:
+        """Log the first refusal of a minute."""
+        self._complaints.tell("world", line)
+
+    def keep(self, kept: dict[str, Any]) -> None:
+        """Write the robot's world to disk."""
+        statefile.save(self._world, kept)
 
     def run(self) -> None:
         """Turn after turn until the service is to stop."""
@@ -142,7 +127,7 @@ class DriverLoop:
         now_s = time.monotonic()
         if force or now_s >= self._next_beat_s:
             self._next_beat_s = now_s + self._config.bus.heartbeat_s
-            report = self._driver.report(self._inbox.refused_total, self._inbox.busy_total)
+            report = self._driver.report(self._inbox.refused.total(), self._inbox.busy.total())
             self.me.bus.publish(ROBOT_STATE, report, self._robot)
 
     def _hold(self) -> bool:
@@ -168,8 +153,8 @@ class DriverLoop:
     def _taken(self, action: Action) -> bool:
         """Whether this action answers the newest observation and may be carried out.
 
-        After a silence, or with another router, halts are asked for first: driver or network may
-        have been away. Without a router nobody could stop the robot.
+        After a silence, or with another router, halts are asked for first. Without a router nobody
+        could stop the robot.
         """
         router = self.me.bus.router
         if not self._driver.answers(action) or not router:
@@ -178,8 +163,6 @@ class DriverLoop:
         if router != self._router or silent_s > self._config.bus.lease_ms / 1000:
             self._learn_of_halts()
         return not self._driver.safety.halted and self._driver.attempt == action.attempt
-
-    # ------------------------------------------------------------ lockstep
 
     def _lockstep_turn(self) -> None:
         """One observation, answered by one action; simulated time stands still meanwhile."""
@@ -212,8 +195,6 @@ class DriverLoop:
                     return action
         return None
 
-    # ------------------------------------------------------------ real time
-
     def _realtime_turn(self) -> None:
         """One control period, or a stand until the robot is fit to drive."""
         try:
@@ -237,11 +218,7 @@ class DriverLoop:
                 return
 
     def _control_period(self) -> None:
-        """One control period: the robot goes on as it does until the answer comes.
-
-        An answer counts until the period is over; without one the robot stops and the next
-        observation, of the same number, says so.
-        """
+        """One control period: the robot goes on as it does until the answer comes, or stops."""
         driver, period_s = self._driver, self._config.robot.period_s
         observation = driver.observe()
         if not driver.safety.halted:  # an answer could not be carried out

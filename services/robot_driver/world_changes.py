@@ -1,13 +1,9 @@
-"""Changes of a robot's world, wished for by message: checked, kept until due, carried out in order.
-
-No bus and no clock in here. A change is due at an episode; which one it is, the actor's answers
-tell (`driver.py`), so that a run with changes can be repeated.
-"""
+"""Changes of a robot's world: checked, kept until the episode they are due in, carried out."""
 
 from bisect import insort
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
 from pydantic import ValidationError
@@ -25,21 +21,8 @@ MAX_REMEMBERED = 64
 """Answers kept for wishes that are sent again because the answer was lost."""
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What became of a change that was due."""
-
-    change: WorldChange
-    refusal: str
-    """Why it could not be carried out; empty if it was."""
-
-
 class WorldChanges:
-    """The changes of one robot's world.
-
-    Args:
-        robot: The robot whose world it is; with None every change is refused.
-    """
+    """The changes of one robot's world; without a robot every change is refused."""
 
     def __init__(self, robot: ChangeableWorld | None) -> None:
         self._robot = robot
@@ -61,20 +44,14 @@ class WorldChanges:
         return self._answers.get(change.id) if change.id else None
 
     def add(self, change: WorldChange) -> None:
-        """Keep a change until it is due.
-
-        Raises:
-            ValueError: It cannot be carried out, as far as that is known now: this robot has no
-                world to change, too many changes wait, or world, start, box or name do not fit to
-                what there will be by then.
-        """
+        """Keep a change until it is due. Raises ValueError if that cannot be, as far as known."""
         if self._robot is None:
             raise ValueError("the world of this robot cannot be changed")
         waits = change.at_episode > 0
         if sum((other.at_episode > 0) == waits for other in self._pending) >= MAX_PENDING:
             raise ValueError(f"{MAX_PENDING} changes wait already")
         self._check(change, self._robot)
-        insort(self._pending, change, key=_episode)
+        insort(self._pending, change, key=attrgetter("at_episode"))
 
     def withdraw(self, ident: str) -> str:
         """Forget a change that waits; return why not, if there is none with this id."""
@@ -82,11 +59,11 @@ class WorldChanges:
         self._pending = [change for change in self._pending if change.id != ident]
         return "" if len(self._pending) < count else f"no change with id {ident} waits"
 
-    def carry_out(self, episode: int) -> list[Outcome]:
-        """Carry out, in order, what is due in this episode of the robot."""
+    def carry_out(self, episode: int) -> list[tuple[WorldChange, str]]:
+        """Carry out, in order, what is due in this episode; each with why not, or nothing."""
         count = sum(change.at_episode <= episode for change in self._pending)
         due, self._pending = self._pending[:count], self._pending[count:]
-        return [Outcome(change, self._refusal(change)) for change in due]
+        return [(change, self._refusal(change)) for change in due]
 
     def answer(self, change: WorldChange, refusal: str) -> WorldChanged:
         """The answer to a wish; to a change it is remembered in case that is sent again."""
@@ -126,13 +103,9 @@ class WorldChanges:
         }
 
     def restore_kept(self, kept: Mapping[str, Any]) -> None:
-        """Bring a robot that begins anew into the world that was kept.
+        """Bring a robot that begins anew into the world that was kept, where it touches nothing.
 
-        It stands at the first start pose that no obstacle touches.
-
-        Raises:
-            KeyError, TypeError or ValueError: what was kept is damaged, or the robot cannot stand
-                anywhere.
+        Raises KeyError, TypeError or ValueError: it is damaged, or the robot cannot stand anywhere.
         """
         obstacles = tuple(Obstacle.model_validate(tree) for tree in kept["obstacles"])
         self.restore(kept["pending"])
@@ -221,7 +194,3 @@ def _world(name: str) -> World:
         return load_world(name)
     except WorldError as error:
         raise ValueError(str(error)) from error
-
-
-def _episode(change: WorldChange) -> int:
-    return change.at_episode

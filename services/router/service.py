@@ -1,8 +1,4 @@
-"""Our own router: a Zenoh session in router mode, for runs on one machine.
-
-Spread-out installations may use the official `zenohd` in its place; services cannot tell them
-apart.
-"""
+"""Our own router: a Zenoh session in router mode. The official `zenohd` may take its place."""
 
 import logging
 from collections.abc import Callable
@@ -27,8 +23,8 @@ def run(
 ) -> None:
     """Route until SIGTERM or SIGINT. Raises ConfigError when it cannot or must not listen there.
 
-    announce: called once with the locator that clients connect to. credentials: folder of the
-    router, with its configuration; empty: open to everybody, with `insecure` from anywhere.
+    announce: called with the locator that clients connect to. credentials: folder of the router,
+    with its configuration; empty: open to everybody, with `insecure` from anywhere.
     """
     refuse_open_door(endpoint, credentials, insecure)
     file = Path(credentials) / "router.json5" if credentials else None

@@ -1,9 +1,8 @@
 """Keys and certificates, one folder for each credential, and the roster of those that hold.
 
-The authority signs the router's certificate and nothing else. Every other certificate has an issuer
-of its own, whose key is forgotten as soon as it has signed. The router trusts exactly the issuers
-on the roster: a certificate that is taken off it is refused at the door, and one that is made anew
-under the same name does not bring the old one back.
+Every certificate but the router's has an issuer of its own, whose key is forgotten as soon as it
+has signed. The router trusts exactly the issuers on the roster, so a certificate that is taken off
+it is refused at the door.
 
     FOLDER/authority/   key and certificate of the authority, roster.json; stays on this machine
     FOLDER/router/      key.pem, cert.pem, ca.pem, router.json5
@@ -11,7 +10,6 @@ under the same name does not bring the old one back.
 """
 
 import json
-import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,6 +25,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from services.security.kinds import Credential, check
 from shared.errors import ConfigError
+from shared.statefile import write_atomically
 
 AUTHORITY_DAYS = 7300
 EARLY = timedelta(days=1)
@@ -139,10 +138,7 @@ class Authority:
         return datetime.fromisoformat(until)
 
     def add(self, credential: Credential, until: datetime) -> Path:
-        """Issue a key and a certificate; one of the same name no longer holds. Returns its folder.
-
-        Raises ConfigError: kind or names make no sense.
-        """
+        """Issue a key and a certificate; an older one no longer holds. Returns its folder."""
         check(credential)
         issuer = identity(f"issuer of {credential.name}", None, until, signs=True)
         made = identity(credential.name, issuer, until)
@@ -189,10 +185,4 @@ def _write_identity(folder: Path, made: Identity, authority: x509.Certificate) -
 def write_private(path: Path, data: bytes) -> None:
     """Write a file that only its owner reads, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-    beside = path.with_name(path.name + ".new")
-    beside.unlink(missing_ok=True)
-    with os.fdopen(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    beside.replace(path)
+    write_atomically(path, data, 0o600)

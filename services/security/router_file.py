@@ -1,8 +1,4 @@
-"""The router's configuration: who may connect, what each may do, how large messages may be.
-
-The official zenohd and our own router read the same file. Keys and certificates are in it, so it
-works wherever it lies, and only its owner may read it.
-"""
+"""The router's configuration, for zenohd too: who may connect and do what. It holds keys."""
 
 import json
 from base64 import b64encode

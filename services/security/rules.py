@@ -1,11 +1,9 @@
 """What a credential may do on the bus: allow-lists for the router, made from the table of streams.
 
-Nothing here names a stream. A row of the table says which roles send and which receive, and a
-credential may do that under its own names only: the driver of `alpha` sends under `robot/alpha`.
-What is not allowed here is refused by the router, silently.
-
-A credential may also hear what it publishes and ask what it answers, under its own names: so a
-health check inside a container needs no second credential.
+A row of the table says which roles send and which receive, and a credential may do that under its
+own names only: the driver of `alpha` sends under `robot/alpha`. It may also hear what it publishes
+and ask what it answers, so that a health check inside a container needs no second credential. What
+is not allowed here is refused by the router, silently.
 """
 
 from collections import defaultdict

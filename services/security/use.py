@@ -15,8 +15,7 @@ if TYPE_CHECKING:
 def using(config: Config, *names: str) -> Config:
     """The configuration with the folder of one process in the place of a folder of all.
 
-    `bus.credentials` may be a folder with a certificate, or hold such folders; `names` are those
-    that fit this process, the best first. Raises ConfigError when there is none.
+    names: folders that fit this process, the best first. Raises ConfigError when there is none.
     """
     given = config.bus.credentials
     if not given:

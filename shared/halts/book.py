@@ -1,8 +1,7 @@
 """Which halts are in force: a book that every driver and every service keeps (no bus, no disk).
 
-A halt is in force until a release names its number. What was released stays released: a copy that
-comes late from somebody who has not heard of the release holds no robot again. Books can so be
-joined in any order, and as often as one likes, with the same result.
+A halt is in force until a release names its number. What was released stays released, so books can
+be joined in any order, and as often as one likes, with the same result.
 """
 
 from collections.abc import Iterable

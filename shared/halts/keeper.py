@@ -1,7 +1,6 @@
 """What services do about halts: hear of them, keep them on disk, tell them to whoever missed them.
 
-A driver that restarts, or comes back from behind a broken network, learns so of a halt in force,
-whoever else has restarted meanwhile. Drivers keep their own book in their own loop.
+A driver that restarts, or comes back from behind a broken network, learns so of a halt in force.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import threading
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from shared import statefile
 from shared.errors import StateError
@@ -39,10 +38,7 @@ class KeptBook:
     """A book of halts on disk. One thread owns it."""
 
     def __init__(self, folder: Path, service: str, ident: str, life: str, robot: str = "") -> None:
-        """Read all books of the run folder. Raises StateError when one is damaged.
-
-        robot: keep only what concerns it; empty: keep everything.
-        """
+        """Read all books of the run folder; keep only what concerns `robot`. Raises StateError."""
         self.book = HaltBook(robot)
         self._who = (service, ident, life)
         self._path = folder / FOLDER / f"{service}-{ident}.msgpack"
@@ -70,10 +66,7 @@ class KeptBook:
         return changed
 
     def join(self, answers: Iterable[Standing]) -> bool:
-        """Take over the halts that others know of; whether there was a new one.
-
-        What they say was released is not taken over: whoever answers does not release a robot.
-        """
+        """Take over the halts that others know of, but no release; whether there was a new one."""
         changed = False
         for answer in answers:
             changed |= self.book.add(answer.halts)
@@ -81,21 +74,19 @@ class KeptBook:
             self._keep()
         return changed
 
-    def standing(self, state: DriverState | str = "", *, stands: bool = False) -> Standing:
+    def standing(self, state: DriverState | Literal[""] = "", *, stands: bool = False) -> Standing:
         """The answer to every message about halts."""
         service, ident, life = self._who
-        return Standing.model_validate(
-            {
-                "service": service,
-                "id": ident,
-                "life": life,
-                "clock_s": clock_s(),
-                "state": state,
-                "stands": stands,
-                "halts": self.book.halts,
-                "released": self.book.released,
-                "problem": self.problem,
-            }
+        return Standing(
+            service=service,
+            id=ident,
+            life=life,
+            clock_s=clock_s(),
+            state=state,
+            stands=stands,
+            halts=self.book.halts,
+            released=self.book.released,
+            problem=self.problem,
         )
 
     def _release(self, message: Release) -> bool:

@@ -1,4 +1,4 @@
-"""Halts robots and releases them, and tells who stands: for the command line and other tools.
+"""Halts robots and releases them, and tells who stands.
 
 A halt is sent again until every driver that is there, or was there meanwhile, has shown that its
 robot stands. Services keep it for drivers that restart (`shared.halts.keeper`).
@@ -19,28 +19,11 @@ REPEAT_S = 0.3
 """A halt that is not confirmed is sent again after this time."""
 NOBODY_S = 3.0
 """Without any robot, the search for one ends after this time."""
+ATTEMPTS = 3
+"""So often a release is tried."""
 DRIVER: Role = "driver"
 Echo = Callable[[str], None]
 RobotOrder = Literal["estop", "clear", "pause", "resume"]
-
-
-def order(
-    bus: Bus,
-    name: RobotOrder,
-    robot: str,
-    echo: Echo,
-    *,
-    number: int | None = None,
-    ended: Callable[[], bool] = lambda: False,
-) -> bool:
-    """Carry out an operator's order; return whether every robot that is meant obeys.
-
-    Raises PeerMissing if there is none.
-    """
-    kind: HaltKind = "estop" if name in ("estop", "clear") else "pause"
-    if name in ("estop", "pause"):
-        return halt(bus, kind, robot, echo, number=number, ended=ended)
-    return release(bus, kind, robot, echo)
 
 
 @dataclass
@@ -51,6 +34,16 @@ class Roll:
     missing: dict[str, str] = field(default_factory=dict)
     """Life to robot: there, or once there, and without a satisfying answer."""
     done: dict[str, Standing] = field(default_factory=dict)
+
+    @property
+    def empty(self) -> bool:
+        """Whether no driver that is meant was ever there."""
+        return not self.done and not self.missing
+
+    @property
+    def complete(self) -> bool:
+        """Whether all that are or were there answered as they should."""
+        return bool(self.done) and not self.missing
 
     def call(self, bus: Bus) -> None:
         """Note who is there now."""
@@ -70,72 +63,71 @@ class Roll:
         return answer.service == DRIVER and self.robot in (ALL, answer.id)
 
 
-def halt(
+def order(
     bus: Bus,
-    kind: HaltKind,
+    name: RobotOrder,
     robot: str,
     echo: Echo,
     *,
     number: int | None = None,
     ended: Callable[[], bool] = lambda: False,
 ) -> bool:
-    """Halt one robot, or all if it is empty; return whether all stand.
+    """Carry out an operator's order for one robot, or all if it is empty; return whether all obey.
 
-    It goes on until all that are or were there stand, or `ended` is true, or nobody is there.
-    number: that of a halt that was sent before.
+    A halt goes on until all that are or were there stand, or `ended` is true. number: that of a
+    halt that was sent before. Raises PeerMissing if there is no robot.
     """
-    message = new_halt(kind, robot, time.time_ns() if number is None else number)
-    roll, start_s = Roll(robot), time.monotonic()
-    while not ended():
+    kind: HaltKind = "estop" if name in ("estop", "clear") else "pause"
+    roll = Roll(robot)
+    if name in ("estop", "pause"):
+        message = new_halt(kind, robot, time.time_ns() if number is None else number)
+        _halt(bus, message, echo, roll, ended)
+    else:
+        _release(bus, kind, echo, roll)
+    for life, ident in roll.missing.items():
+        echo(f"{ident} (life {life}): has not answered, or does not obey")
+    return roll.complete
+
+
+def _halt(bus: Bus, message: Halts, echo: Echo, roll: Roll, ended: Callable[[], bool]) -> None:
+    start_s = time.monotonic()
+    while not roll.complete and not ended():
         for answer in _round(bus, message, REPEAT_S, roll):
             if answer.problem:
                 echo(f"{_name(answer)}: stands, but a restart would forget it: {answer.problem}")
             elif answer.stands and roll.note(answer):
                 echo(f"{_name(answer)}: {answer.state}, stands")
-        if roll.done and not roll.missing:
-            return True
-        if not roll.done and not roll.missing and time.monotonic() - start_s > NOBODY_S:
+        if roll.empty and time.monotonic() - start_s > NOBODY_S:
             raise PeerMissing(
                 f"no robot of run {bus.run!r} answers at {bus.config.endpoint}; services that "
-                f"are there hold it for a robot that starts{_meant(bus, robot)}"
+                f"are there hold it for a robot that starts{_meant(bus, roll.robot)}"
             )
-    for life, name in roll.missing.items():
-        echo(f"{name} (life {life}): has not answered")
-    return False
 
 
-def release(bus: Bus, kind: HaltKind, robot: str, echo: Echo, attempts: int = 3) -> bool:
-    """End the halts of one kind that are in force; return whether no robot meant is held by one.
-
-    Each release names the halts and lives that answered just before, and expires there.
-    """
-    roll = Roll(robot)
-    for _ in range(attempts):
+def _release(bus: Bus, kind: HaltKind, echo: Echo, roll: Roll) -> None:
+    """Each release names the halts and lives that answered just before, and expires there."""
+    for _ in range(ATTEMPTS):
         answers = list(_round(bus, Halts(), REPEAT_S, roll))
-        deadlines = [
+        deadlines = tuple(
             Deadline(life=answer.life, until_s=answer.clock_s + RELEASE_WITHIN_S)
             for answer in answers
-        ]
+        )
         numbers = {h.number for answer in answers for h in answer.halts if h.kind == kind}
         if numbers:
-            message = Release(
-                numbers=tuple(sorted(numbers)[:MAX_HALTS]), robot=robot, deadlines=tuple(deadlines)
-            )
+            some = tuple(sorted(numbers)[:MAX_HALTS])
+            message = Release(numbers=some, robot=roll.robot, deadlines=deadlines)
             answers = list(_round(bus, message, REPEAT_S, roll))
-        for answer in answers:
+        for answer in filter(roll.concerns, answers):
             held = any(halt.kind == kind for halt in answer.halts)
-            if roll.concerns(answer) and not held and not answer.problem and roll.note(answer):
-                echo(f"{_name(answer)}: {answer.state}")
-            elif roll.concerns(answer) and answer.problem:
+            if answer.problem:
                 echo(f"{_name(answer)}: not released: {answer.problem}")
-        if roll.done and not roll.missing:
-            return True
-    if not roll.done and not roll.missing:
+            elif not held and roll.note(answer):
+                echo(f"{_name(answer)}: {answer.state}")
+        if roll.complete:
+            return
+    if roll.empty:
         text = f"no robot of run {bus.run!r} answers at {bus.config.endpoint}"
-        raise PeerMissing(text + _meant(bus, robot))
-    for life, name in roll.missing.items():
-        echo(f"{name} (life {life}): has not answered, or stays halted")
-    return False
+        raise PeerMissing(text + _meant(bus, roll.robot))
 
 
 def _round(bus: Bus, message: Message, wait_s: float, roll: Roll) -> Iterator[Standing]:

@@ -22,11 +22,7 @@ class Batch(NamedTuple):
     rewards: Tensor
 
     def mirrored(self, which: Tensor) -> "Batch":
-        """The batch with some samples, bool [k], seen in a mirror: left is right, rewards stay.
-
-        The robot and its actions are symmetrical, so what it would have got in the mirrored
-        corridor is known.
-        """
+        """The batch with some samples, bool [k], seen in a mirror: left is right, rewards stay."""
         images = torch.where(which[:, None, None], self.images.flip(-1), self.images)
         sides = torch.tensor(MIRRORED, device=self.actions.device)
         actions = torch.where(which, sides[self.actions], self.actions)

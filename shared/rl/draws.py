@@ -1,7 +1,4 @@
-"""Counter-based randomness: every draw is a function of the seed, a role and a position.
-
-It does not matter which process draws, in which order, or how often it restarted.
-"""
+"""Counter-based randomness: every draw is a function of the seed, a role and a position."""
 
 import hashlib
 
@@ -12,8 +9,7 @@ import numpy.typing as npt
 def generator(seed: int, role: str, *position: int | str) -> np.random.Generator:
     """A fresh generator for one place, e.g. ``generator(seed, "policy", robot, episode, step)``.
 
-    Equal arguments give equal streams; any difference gives an independent one (Philox keyed by a
-    128-bit hash).
+    Any difference gives an independent stream (Philox keyed by a 128-bit hash).
     """
     place = "\x1f".join([str(seed), role, *(f"{type(p).__name__}:{p}" for p in position)])
     digest = hashlib.blake2b(place.encode(), digest_size=16).digest()
@@ -21,10 +17,7 @@ def generator(seed: int, role: str, *position: int | str) -> np.random.Generator
 
 
 def uniform(seed: int, role: str, numbers: npt.NDArray[np.uint64]) -> npt.NDArray[np.float64]:
-    """Return one draw from [0, 1) for each number, always the same one: float64 [n].
-
-    A generator for each number would take a thousand times as long (SplitMix64 in its place).
-    """
+    """One draw from [0, 1) for each number, always the same one: float64 [n] (SplitMix64)."""
     digest = hashlib.blake2b(f"{seed}\x1f{role}".encode(), digest_size=8).digest()
     with np.errstate(over="ignore"):
         mixed = numbers.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)

@@ -35,10 +35,7 @@ Progress = Callable[[int, int], None]
 
 
 class Engine(Protocol):
-    """Runs one version of the network over any number of images.
-
-    What it says of an image is the same bits, whichever images come with it.
-    """
+    """Runs one version of the network; an image's bits are the same, whichever come with it."""
 
     def load(self, network: QNetwork) -> None:
         """Take over the network's parameters."""
@@ -111,11 +108,7 @@ def network_input(images: Images, device: str) -> Tensor:
 
 
 def scaled(images: Tensor) -> Tensor:
-    """uint8 [n, 50, 75] to float32 [n, 1, 50, 75] in [0, 1], on the device they lie on.
-
-    One channel is laid out both ways at once; made last by its strides, the convolutions take it
-    as it is instead of copying everything after the first of them.
-    """
+    """uint8 [n, 50, 75] to float32 [n, 1, 50, 75] in [0, 1], laid out as convolutions want it."""
     channels_last = images.unsqueeze(-1).permute(0, 3, 1, 2)
     return channels_last.to(torch.float32).div_(255.0)
 

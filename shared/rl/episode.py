@@ -88,9 +88,8 @@ class OpenEpisode:
     def end(self, ending: Ending) -> Release:
         """End the episode and keep only what is carried over (A10).
 
-        bump: all samples are released, nothing remains; the last one is terminal (E6).
-        full: all but the last 50 are released, those 50 open the next episode.
-        interrupted: the last 50 cannot look ahead any more; they are dropped (E10).
+        bump: all samples are released; the last one is terminal (E6). full: all but the last 50 are
+        released, those open the next episode. interrupted: the last 50 are dropped (E10).
         """
         n, horizon = len(self._steps), self._config.horizon
         if ending == "bump" and n == 0:
@@ -118,11 +117,7 @@ def with_current_max_q(
 
 
 def stale_steps(release: Release, version: int) -> npt.NDArray[np.int64]:
-    """Indices of next states of released samples whose prediction is of another version.
-
-    Rewards are computed with the network in force when they are computed (A17), so carried-over
-    samples are predicted anew.
-    """
+    """Indices of next states of released samples whose prediction is of another version (A17)."""
     last = min(release.count, len(release.steps) - 1)
     return np.array(
         [i for i in range(1, last + 1) if release.steps[i].max_q_version != version], np.int64

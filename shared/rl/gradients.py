@@ -1,12 +1,7 @@
-"""How the gradient of a mini-batch is computed: shares, precision, deferral, means of weights.
-
-What is learnt, and when, stands in `learning`. Nothing here changes what the rule asks for; it
-decides the order of additions, and with it the last bits.
-"""
+"""How the gradient of a mini-batch is computed: shares, precision, means of weights."""
 
 from __future__ import annotations
 
-import math
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
@@ -14,9 +9,8 @@ import torch
 from torch import Tensor
 
 from shared.rl import trunk
-from shared.rl.batches import Batches, Mask, Ranks, ResidentBatches
+from shared.rl.batches import Batches, Mask, Ranks
 from shared.rl.engine import arithmetic, scaled
-from shared.rl.memory import SampleStore
 from shared.rl.network import QNetwork
 
 if TYPE_CHECKING:
@@ -33,24 +27,11 @@ class Gradients:
         self.deferred = numerics.device != "cpu"
         """Whether a fitting phase never waits for the device: losses are read at its end."""
 
-    def stored(self, samples: SampleStore) -> Batches:
-        """Mini-batches gathered from the store one by one."""
-        return Batches(samples, self._numerics.device)
-
-    def of_fit(self, samples: SampleStore) -> Batches:
-        """Mini-batches of a fitting phase; on a device not waited for, all at once."""
-        return (
-            ResidentBatches(samples, self._numerics.device)
-            if self.deferred
-            else self.stored(samples)
-        )
-
     def compute(self, batches: Batches, ranks: Ranks, mirrored: Mask | None = None) -> Tensor:
         """Put the gradient of a mini-batch where the optimiser looks; returns the loss.
 
         Each thread takes one share of the mini-batch, and the shares are added up in order: the
-        result depends on the number of threads, never on how they run. Threads that wait for each
-        other after every operation would be slower, and hopeless beside another busy process.
+        result depends on the number of threads, never on how they run.
         """
         size = -(-len(ranks) // self._numerics.threads)
         shares = [slice(start, start + size) for start in range(0, len(ranks), size)]
@@ -87,25 +68,6 @@ class Gradients:
             return loss.detach(), *torch.autograd.grad(loss, list(network.parameters()))
 
 
-class Losses:
-    """The losses of a fitting phase, read at once or, deferred, at its end."""
-
-    def __init__(self, *, deferred: bool = False) -> None:
-        self._deferred = deferred
-        self._unread: list[Tensor] = []
-
-    def read(self, loss: Tensor, *, last: bool) -> float | None:
-        """The loss of a step, or the mean of all at the last one; None where it is not known yet.
-
-        Raises FloatingPointError for a loss that is not finite; deferred, at the last step only:
-        the weights are useless then.
-        """
-        if not self._deferred:
-            return _checked(float(loss))
-        self._unread.append(loss)
-        return _checked(float(torch.stack(self._unread).mean())) if last else None
-
-
 class MeanOfWeights:
     """The mean of a network's weights after several steps."""
 
@@ -135,10 +97,3 @@ class MeanOfWeights:
         if self.count:
             for own, mean in zip(network.parameters(), self._mean, strict=True):
                 own.copy_(mean)
-
-
-def _checked(loss: float) -> float:
-    """Raise FloatingPointError for a loss that is not finite."""
-    if not math.isfinite(loss):
-        raise FloatingPointError(f"loss is {loss}")
-    return loss

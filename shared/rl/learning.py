@@ -1,10 +1,8 @@
-"""What the network learns and when (sections 3.4.2, 3.4.3, 3.5.3): step, fit, target rule.
-
-How a gradient is computed stands in `gradients`; nothing here depends on it.
-"""
+"""What the network learns and when (sections 3.4.2, 3.4.3, 3.5.3): step, fit, target rule."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -14,10 +12,10 @@ import torch
 from torch import Tensor
 from torch.optim.rmsprop import rmsprop
 
-from shared.rl.batches import Batches, Mask, Ranks
+from shared.rl.batches import Batches, Mask, Ranks, ResidentBatches
 from shared.rl.draws import generator
 from shared.rl.engine import arithmetic
-from shared.rl.gradients import Gradients, Losses, MeanOfWeights
+from shared.rl.gradients import Gradients, MeanOfWeights
 from shared.rl.memory import SampleStore
 from shared.rl.network import QNetwork, initialised
 from shared.rl.schedule import Moment, due
@@ -38,10 +36,7 @@ class Trained:
 
 
 class Trainer:
-    """The train network with its optimiser, and the target network copied from it.
-
-    The two are named by role, never by symbol (E4). Only target versions leave the learner.
-    """
+    """The train network with its optimiser, and the target network copied from it (E4)."""
 
     def __init__(
         self, network: NetworkConfig, learning: LearningConfig, numerics: Numerics, seed: int
@@ -71,10 +66,7 @@ class Trainer:
         self._learning = learning
 
     def learn(self, samples: SampleStore, now: Moment) -> Iterator[Trained]:
-        """Everything the network learns after one episode (E25); yields after each mini-batch.
-
-        A fitting phase when due, else `mini_batches_per_episode` steps.
-        """
+        """Everything learnt after one episode (E25), a fit when due. Yields after a mini-batch."""
         self._mean.restart()
         if not len(samples):
             return
@@ -108,8 +100,9 @@ class Trainer:
         mirrored: bool [k], which samples to look at in a mirror. Returns the loss; raises
         FloatingPointError when it is not finite, leaving the weights as they were.
         """
-        loss = self._step(self.gradients.stored(samples), ranks, mirrored, Losses())
-        assert loss is not None
+        batches = Batches(samples, self._numerics.device)
+        loss = self._finite([self.gradients.compute(batches, ranks, mirrored)])
+        self._descend()
         return loss
 
     def tensors(self) -> dict[str, Tensor]:
@@ -150,10 +143,15 @@ class Trainer:
 
     def _fit(self, samples: SampleStore, episode: int) -> Iterator[Trained]:
         """A36: epochs of shuffled mini-batches, the last, partial one included (E30)."""
-        batches, losses = self.gradients.of_fit(samples), Losses(deferred=self.gradients.deferred)
-        count = self.fit_batches(len(samples))
+        deferred, unread = self.gradients.deferred, list[Tensor]()
+        kind = ResidentBatches if deferred else Batches
+        batches, count = kind(samples, self._numerics.device), self.fit_batches(len(samples))
         for done, (epoch, ranks, mirrored) in enumerate(self._shuffled(len(samples), episode), 1):
-            loss = self._step(batches, ranks, mirrored, losses, last=done == count)
+            unread.append(self.gradients.compute(batches, ranks, mirrored))
+            loss = None
+            if not deferred or done == count:
+                loss, unread = self._finite(unread), []
+            self._descend()
             yield Trained(loss, epoch + 1, done, count)
         self.fits += 1
 
@@ -171,26 +169,11 @@ class Trainer:
         """Which samples of a mini-batch to look at in a mirror: by chance, half of them."""
         return draw.random(count) < 0.5 if self._learning.augmentation == "mirror" else None
 
-    def _step(
-        self,
-        batches: Batches,
-        ranks: Ranks,
-        mirrored: Mask | None,
-        losses: Losses,
-        *,
-        last: bool = True,
-    ) -> float | None:
-        """Gradient, loss, and the optimiser's step; the loss as far as `losses` tells it now."""
-        computed = self.gradients.compute(batches, ranks, mirrored)
-        try:
-            loss = losses.read(computed, last=last)
-        except FloatingPointError as error:
-            raise FloatingPointError(f"{error} at training step {self.train_steps}") from None
-        with arithmetic(self._numerics):
-            self._descend()
-            if self._learning.target_average:
-                self._mean.take()
-        self.train_steps += 1
+    def _finite(self, losses: list[Tensor]) -> float:
+        """The mean of these losses. Raises FloatingPointError when it is not finite."""
+        loss = float(torch.stack(losses).mean())
+        if not math.isfinite(loss):
+            raise FloatingPointError(f"loss is {loss} at training step {self.train_steps}")
         return loss
 
     @torch.no_grad()
@@ -200,20 +183,24 @@ class Trainer:
         The function, and not `torch.optim.RMSprop`: the class imports a compiler, for a second.
         """
         learning = self._learning
-        rmsprop(
-            self._parameters,
-            [parameter.grad for parameter in self._parameters if parameter.grad is not None],
-            self._squares,
-            [],
-            [],
-            self._steps,
-            lr=learning.learning_rate,
-            alpha=learning.rmsprop_alpha,
-            eps=learning.rmsprop_epsilon,
-            weight_decay=0.0,
-            momentum=0.0,
-            centered=False,
-        )
+        with arithmetic(self._numerics):
+            rmsprop(
+                self._parameters,
+                [parameter.grad for parameter in self._parameters if parameter.grad is not None],
+                self._squares,
+                [],
+                [],
+                self._steps,
+                lr=learning.learning_rate,
+                alpha=learning.rmsprop_alpha,
+                eps=learning.rmsprop_epsilon,
+                weight_decay=0.0,
+                momentum=0.0,
+                centered=False,
+            )
+            if learning.target_average:
+                self._mean.take()
+        self.train_steps += 1
 
 
 def _copy_checked(own: Tensor, given: Tensor, name: str) -> None:

@@ -1,8 +1,4 @@
-"""The replay memory: samples in order of insertion, each image stored once as uint8.
-
-`SampleStore` holds what training needs and serves as the learner's mirror; `ReplayMemory` adds
-where samples come from and the columns of `retention`, which decides what goes.
-"""
+"""The replay memory: samples in order of insertion, each image stored once as uint8."""
 
 from collections.abc import Iterable, Iterator, Sequence
 
@@ -99,10 +95,7 @@ class SampleStore:
         return ranks
 
     def set_rewards(self, ids: Ids, rewards: npt.NDArray[np.float32]) -> None:
-        """Replace the rewards of these samples.
-
-        Raises KeyError if one is missing and ValueError if a reward is outside -1..1.
-        """
+        """Replace rewards. Raises KeyError if a sample is missing, ValueError outside -1..1."""
         if not np.all(np.abs(rewards) <= 1.0):
             raise ValueError("reward: expected -1..1")
         self.rows["reward"][self.ranks(ids)] = rewards

@@ -145,10 +145,7 @@ def to_bytes(network: QNetwork) -> bytes:
 
 
 def load_bytes(network: QNetwork, data: bytes) -> None:
-    """Take over parameters from safetensors bytes after checking them (`checked`).
-
-    Raises ValueError and leaves the network as it was if anything does not fit.
-    """
+    """Take over parameters from safetensors bytes: all or, with ValueError, none (`checked`)."""
     tensors = checked(network, data, shaped=False)
     with torch.no_grad():
         for name, parameter in network.named_parameters():
@@ -158,14 +155,8 @@ def load_bytes(network: QNetwork, data: bytes) -> None:
 def checked(network: QNetwork, data: bytes, *, shaped: bool = True) -> dict[str, Tensor]:
     """The tensors in safetensors bytes, once size, names, shapes, types and values are right.
 
-    Args:
-        network: Has the names and shapes. Its own values do not matter.
-        data: Of one version of a network.
-        shaped: Also require that the metadata tell the shape of the network. They are compared in
-            any case; files that were written without them may still be read.
-
-    Raises:
-        ValueError: Something does not fit.
+    network: has names and shapes; its values do not matter. shaped: require that the metadata tell
+    the shape of the network, as older files do not. Raises ValueError.
     """
     most = min(MAX_WEIGHT_BYTES, 4 * parameter_count(network) + MAX_HEAD_BYTES)
     if len(data) > most:
@@ -194,27 +185,9 @@ def checked(network: QNetwork, data: bytes, *, shaped: bool = True) -> dict[str,
     return tensors
 
 
-class WeightsHash:
-    """First 16 hex digits of SHA-256 over safetensors bytes, given part by part."""
-
-    def __init__(self) -> None:
-        self._sha = hashlib.sha256()
-
-    def add(self, data: bytes) -> None:
-        """Take in the next part."""
-        self._sha.update(data)
-
-    @property
-    def text(self) -> str:
-        """The hash of all parts so far."""
-        return self._sha.hexdigest()[:16]
-
-
 def weights_hash(data: bytes) -> str:
-    """The `WeightsHash` of whole safetensors bytes."""
-    digest = WeightsHash()
-    digest.add(data)
-    return digest.text
+    """First 16 hex digits of SHA-256 over safetensors bytes."""
+    return hashlib.sha256(data).hexdigest()[:16]
 
 
 def parameter_count(network: QNetwork) -> int:

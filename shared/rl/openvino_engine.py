@@ -32,8 +32,7 @@ output more costs time in each pass."""
 class OpenVinoEngine:
     """One compiled model with the usual heads; compiling takes some hundredths of a second.
 
-    Its bits do not depend on the number of images in a pass: passes are as large as they come, up
-    to `MOST`, and `numerics.batch` plays no part.
+    Its bits do not depend on the number of images in a pass: `numerics.batch` plays no part.
     """
 
     def __init__(self, numerics: Numerics) -> None:
@@ -125,11 +124,7 @@ def _state(maps: ov.Output, p: Parameters) -> ov.Node:
 
 
 def _all_hidden(maps: ov.Output, p: Parameters, actions: Floats) -> ov.Node:
-    """FConn3 for all actions [n, 3, 128].
-
-    It multiplies state and action side by side: the action's part is the same for all images
-    and computed here, once.
-    """
+    """FConn3 for all actions [n, 3, 128]. The action's part is the same for all images."""
     state = _state(maps, p)
     size = len(p["fconn1.bias"])
     coded = np.maximum(actions @ p["fconn2.weight"].T + p["fconn2.bias"], 0.0)

@@ -1,4 +1,4 @@
-"""Action policies (section 3.3): eps-greedy, roulette, and their mixture."""
+"""Action policies (section 3.3): eps-greedy, roulette, their mixture; the decision of an actor."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from shared import plugins
-from shared.facts import ACTION_COUNT
+from shared.facts import ACTION_COUNT, Chooser
+from shared.rl.draws import generator
 
 if TYPE_CHECKING:
-    from shared.config import PolicyConfig
+    from shared.config import Config, PolicyConfig
 
 Values = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
@@ -57,6 +58,23 @@ def choose(values: Values, config: PolicyConfig, rng: np.random.Generator) -> tu
     greedy = config.kind != "roulette" and bool(branch >= config.epsilon)
     chances = greedy_distribution(values) if greedy else exploring_distribution(values, config)
     return _pick(chances, float(draw)), greedy
+
+
+def decide(
+    config: Config, robot: str, values: Values, *, filling: bool, episode: int, step: int
+) -> tuple[int, Chooser]:
+    """Choose an action (A13, A18-A20, E9); by the network's greedy branch, or chance.
+
+    values: clipped Q of all actions, float32 [actions]. filling: the memory is still being filled.
+    episode: fill submissions of the robot so far while filling, else its counted episodes. step: in
+    its open episode.
+    """
+    role = "fill" if filling else "policy"
+    draw = generator(config.run.seed, role, robot, episode, step)
+    if filling and config.memory.fill == "random":
+        return choose_uniformly(draw), "chance"
+    action, greedy = choose(values, config.policy, draw)
+    return action, "network" if greedy else "chance"
 
 
 def choose_greedily(values: Values, rng: np.random.Generator) -> int:

@@ -1,9 +1,4 @@
-"""Inference with fixed arithmetic: what a role predicts does not depend on who else asks.
-
-The value of an image is the same bits whoever shares its pass. How an engine achieves that, by
-padding all passes to one size or by its nature, is its own business (`shared.rl.engine`); engine,
-threads, precision and batch are configuration (docs/architecture.md).
-"""
+"""Inference with fixed arithmetic: what a role predicts does not depend on who else asks."""
 
 from __future__ import annotations
 
@@ -76,10 +71,7 @@ class Predictor:
     def hidden(
         self, images: Images, actions: npt.NDArray[np.uint8], progress: Progress | None = None
     ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-        """FConn3 for the action of each image, float32 [n, 128], and the unclipped Q, float32 [n].
-
-        Q is the last layer's weights times FConn3, plus its bias.
-        """
+        """FConn3 for the action of each image, float32 [n, 128], and unclipped Q, float32 [n]."""
         every = self._engine.run(images, "hidden", progress)
         of_actions = every.reshape(len(images), ACTION_COUNT, HIDDEN + 1)
         own = of_actions[np.arange(len(images)), actions]

@@ -1,8 +1,8 @@
 """Makes the network's image of a camera frame (A22, E29): resize first, then grey.
 
-The rounding is part of the definition, so that simulation, hardware drivers and tests agree to
-the last bit, whatever the processor: exact means over areas, and each step ends in uint8, rounded
-half up. Whatever changes one pixel must raise `PREPROCESS_VERSION`.
+The rounding is part of the definition, to the last bit on any processor: exact means over areas,
+and each step ends in uint8, rounded half up. Whatever changes one pixel must raise
+`PREPROCESS_VERSION`.
 """
 
 from typing import Any
@@ -20,16 +20,9 @@ _BT601 = np.array([4899, 9617, 1868], np.int32)
 
 
 def preprocess(frame: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Area-resize an RGB frame to 50x75 and turn it grey (A22, E29).
+    """Area-resize an RGB frame uint8 [h, w, 3] and turn it grey (A22, E29): uint8 [50, 75].
 
-    Args:
-        frame: uint8 [h, w, 3], RGB, h and w at least 1; the usual camera gives [720, 1280, 3].
-
-    Returns:
-        uint8 [50, 75]: grey from 0 to 255, rounded half up. Divide by 255 for the network.
-
-    Raises:
-        ValueError: The frame has another shape or type.
+    Divide by 255 for the network. Raises ValueError for a frame of another shape or type.
     """
     if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or 0 in frame.shape:
         raise ValueError(f"expected a uint8 [h, w, 3] frame, got {frame.dtype} {frame.shape}")
@@ -51,10 +44,7 @@ def _resized(frame: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
 def _area_sums(
     values: npt.NDArray[Any], cells: int, dtype: type[np.integer[Any]]
 ) -> npt.NDArray[Any]:
-    """Weighted sums along the first axis over `cells` equal cells; weights add up to its length.
-
-    Lengths count in parts of 1 / `cells` of a value, so that all borders are whole numbers.
-    """
+    """Weighted sums along the first axis over `cells` equal cells; weights add up to its length."""
     border, part = np.divmod(np.arange(cells + 1) * len(values), cells)
     start, end = border[:-1], border[1:]
     shape = (cells,) + (1,) * (values.ndim - 1)

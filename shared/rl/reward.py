@@ -1,4 +1,4 @@
-"""Rewards of a finished episode (section 3.2, Eq 3.1-3.3)."""
+"""Rewards of a finished episode (section 3.2, Eq 3.1-3.3), and later (section 3.5.2, Eq 3.5)."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
-    from shared.config import RewardConfig
+    from shared.config import MemoryConfig, RewardConfig
 
 Floats = npt.NDArray[np.float64]
+Rewards = npt.NDArray[np.float32]
 TERMINAL_REWARD = -1.0
 
 
@@ -42,7 +43,7 @@ def episode_rewards(
     horizon: int,
     max_distance_m: float,
     config: RewardConfig,
-) -> npt.NDArray[np.float32]:
+) -> Rewards:
     """Eq 3.1 for the samples an episode releases.
 
     xy_m: [m, 2] position at each sample in metres. next_max_q: [n] clipped max_a Q(s_{t+1}, a); its
@@ -69,3 +70,17 @@ def episode_rewards(
     if bump:
         reward[-1] = TERMINAL_REWARD
     return np.clip(reward, -1.0, 1.0).astype(np.float32)
+
+
+def equalised(rewards: Rewards, values: Rewards, config: MemoryConfig) -> Rewards:
+    """Reward equalisation, Eq 3.5: r <- keep r + (1 - keep) Q(s, a), clipped to [-1, 1].
+
+    rewards, values: float32 [n], the latter clipped predictions of the target network for each
+    stored action. Terminal samples drift too unless `protect_terminal` (E24); no other sample can
+    have the reward -1 (E7).
+    """
+    keep = np.float32(config.equalise_keep)
+    fresh = np.clip(keep * rewards + (np.float32(1.0) - keep) * values, -1.0, 1.0)
+    if config.protect_terminal:
+        fresh = np.where(rewards == np.float32(TERMINAL_REWARD), rewards, fresh)
+    return fresh.astype(np.float32)

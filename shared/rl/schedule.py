@@ -15,11 +15,7 @@ class Moment(NamedTuple):
 
 
 def due(now: Moment, every_episodes: int, every_actions: int = 0) -> bool:
-    """Whether a periodic step falls on this moment.
-
-    With `every_actions`, it does at the end of the episode that reaches a multiple of it. Otherwise
-    it does at every multiple of `every_episodes`. 0 of both means never.
-    """
+    """Whether a periodic step falls on this moment, by actions if both are given; 0: never."""
     if not now.episode:
         return False
     if every_actions:

@@ -43,11 +43,7 @@ def similar_to_newer(descriptors: Descriptors, bits: int, rule: Literal["paper",
 
 
 def _signs(descriptors: Descriptors) -> Tensor:
-    """Bits as -1 and 1, so that a matrix product counts agreements.
-
-    Products are whole numbers up to 120: exact in bfloat16 too, which is used where the processor
-    multiplies it faster.
-    """
+    """Bits as -1 and 1. Products are whole numbers up to 120: exact in bfloat16 too."""
     import torch
 
     signs = np.unpackbits(descriptors, axis=1).astype(np.float32) * 2.0 - 1.0
@@ -67,7 +63,8 @@ def _any_newer(signs: Tensor, least_product: int) -> Mask:
             open_rows = start + np.flatnonzero(~marked[start:stop])
             if not len(open_rows):
                 break
-            padded = np.resize(open_rows, _rounded_up(len(open_rows)))  # over again from the first
+            size = -(-len(open_rows) // STEP) * STEP
+            padded = np.resize(open_rows, size)  # over again from the first
             nearest = _largest_products(signs[padded], signs[newer])
             marked[open_rows] = (nearest >= least_product)[: len(open_rows)]
     return marked
@@ -84,10 +81,6 @@ def _pieces(start: int, end: int) -> Iterator[slice]:
 def _largest_products(rows: Tensor, others: Tensor) -> npt.NDArray[np.int16]:
     """The largest product of each row with any of the others."""
     return (rows @ others.T).amax(dim=1).short().numpy()
-
-
-def _rounded_up(count: int) -> int:
-    return -(-count // STEP) * STEP
 
 
 def _uncovered(signs: Tensor, least_product: int) -> Mask:

@@ -1,8 +1,7 @@
 """Turning on the spot where nothing good is predicted (A45, Fig 4.20, E33).
 
-A frozen network acts greedily. Where the reward predicted for its action is negative, the robot
-turns on the spot instead: to the left if its action turns left, else to the right, and on in that
-direction until an action with a prediction of 0 or more comes up.
+Where the reward predicted for its best action is negative, the robot turns on the spot, to the side
+of that action, else to the right, until an action with a prediction of 0 or more comes up.
 """
 
 import math

@@ -1,9 +1,7 @@
 """The convolutions for training in reduced precision: forward in float32, backward in bfloat16.
 
-Rounding the forward pass bends the gradient: every prediction shifts a little, and with it what is
-left of its error, by which all else is multiplied. Rounding the backward pass only adds noise that
-averages out; benchmarks/training_step.py measures both. So bfloat16 holds for the backward pass,
-two thirds of the work.
+Rounding the forward pass bends the gradient; rounding the backward pass, two thirds of the work,
+only adds noise that averages out. benchmarks/training_step.py measures both.
 """
 
 from typing import Any

@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from shared.columns import EPISODE
-from shared.rl.equalisation import equalised
 from shared.rl.memory import SAMPLE, Images, ReplayMemory, world_indices
 from shared.rl.retention.strategy import Discard, Situation, beyond, discard
+from shared.rl.reward import equalised
 from shared.rl.schedule import Moment, due
 
 if TYPE_CHECKING:

@@ -1,10 +1,8 @@
 """Turns what a robot tells and is told into ROS 2 messages (`ros2_types.py`) and back.
 
-Everything that comes from the network is checked before it means anything: sizes, encapsulation,
-length, finite numbers. Units and axes are those of ROS, which are ours: SI, x forward, y left,
-angles counter-clockwise. Stamps are nanoseconds of the robot's clock; 0: none told.
-
-The reason of a BadMessage comes first and is of a small vocabulary, details follow a colon.
+Whatever comes is checked first. Units and axes are those of ROS, which are ours: SI, x forward, y
+left, angles counter-clockwise. Stamps are nanoseconds of the robot's clock; 0: none told. The
+reason of a BadMessage comes first and is of a small vocabulary, details follow a colon.
 """
 
 import math
@@ -14,7 +12,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from services.robot_driver.real.link import Battery
-from services.robot_driver.real.picture import ENCODINGS, RgbImage, decoded, raw
+from services.robot_driver.real.picture import RgbImage, decoded, raw
 from services.robot_driver.real.ros2_types import (
     BatteryType,
     BumperType,
@@ -43,8 +41,6 @@ VOLTS = (1.0, 100.0)
 """A voltage beyond these is none."""
 MAX_WAY_M = 1e6
 """Odometry beyond this is nonsense."""
-_GREY = np.array([9798, 19235, 3735])
-"""BT.601 weights of red, green and blue, in parts of 2^15."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +51,6 @@ class Stamped(Generic[T]):
     stamp_ns: int
     facts: str = ""
     """What else it tells, for people."""
-
-
-# ---------------------------------------------------------------- from the robot
 
 
 def decode_odometry(data: bytes) -> Stamped[Pose]:
@@ -80,10 +73,7 @@ def decode_odometry(data: bytes) -> Stamped[Pose]:
 
 
 def decode_camera(data: bytes, kind: CameraType) -> Stamped[RgbImage]:
-    """The picture of a sensor_msgs/Image or CompressedImage: uint8 [h, w, 3], RGB.
-
-    Raises BadMessage also for what `picture.py` refuses, and depth images.
-    """
+    """The picture of an Image or CompressedImage: uint8 [h, w, 3], RGB. Raises BadMessage."""
     message = decode(data, kind)
     if kind == "CompressedImage":
         if "compressedDepth" in message.format:
@@ -97,23 +87,10 @@ def decode_camera(data: bytes, kind: CameraType) -> Stamped[RgbImage]:
     return Stamped(pixels, stamp_ns_of(message), facts)
 
 
-def _from_rgb(rgb: RgbImage, encoding: str) -> RgbImage:
-    """An RGB picture as uint8 [h, w, bytes] of an encoding; what is neither colour is 255."""
-    size, order = ENCODINGS[encoding]
-    pixels = np.full((*rgb.shape[:2], size), 255, np.uint8)
-    grey = (rgb @ _GREY + (1 << 14)) >> 15
-    pixels[:, :, order] = rgb if len(order) == 3 else grey[:, :, np.newaxis]
-    return pixels
-
-
 def decode_bumper(data: bytes, kind: BumperType) -> Stamped[bool]:
     """Whether there is contact, of a std_msgs/Bool or a Create 3's hazards.
 
-    A limit of its own to backing up and something near are no contact.
-
-    Raises:
-        BadMessage: Also where a wheel hangs in the air, because a robot that was lifted stands, and
-            for hazards that nobody knows.
+    Raises BadMessage, also for a robot that was lifted and for hazards that nobody knows.
     """
     message = decode(data, kind)
     if kind == "Bool":
@@ -127,11 +104,9 @@ def decode_bumper(data: bytes, kind: BumperType) -> Stamped[bool]:
 
 
 def decode_battery(data: bytes, kind: BatteryType, *, percent: bool = False) -> Stamped[Battery]:
-    """Charge and voltage, of sensor_msgs/BatteryState or rto_msgs/PowerReadings.
+    """Charge and voltage, of BatteryState or PowerReadings. Raises BadMessage.
 
-    A BatteryState without a battery, with a charge that is no number, or with neither charge nor
-    voltage tells nothing. percent: this robot tells percent in place of a part of one, as any
-    does that told more than `FULL`. Raises BadMessage.
+    What means nothing is told as None. percent: the robot tells percent, not a part of one.
     """
     message = decode(data, kind)
     voltage = float(message.voltage)
@@ -151,12 +126,10 @@ def decode_velocity(data: bytes, kind: VelocityType) -> Stamped[Velocity]:
     message = decode(data, kind)
     twist = message.twist if kind == "TwistStamped" else message
     velocity = Velocity(twist.linear.x, twist.linear.y, twist.angular.z)
-    if not all(math.isfinite(n) for n in (*_xyz(twist.linear), *_xyz(twist.angular))):
+    parts = (twist.linear, twist.angular)
+    if not all(math.isfinite(n) for part in parts for n in (part.x, part.y, part.z)):
         raise BadMessage("not finite")
     return Stamped(velocity, stamp_ns_of(message) if kind == "TwistStamped" else 0)
-
-
-# ---------------------------------------------------------------- to the robot, and as one
 
 
 def encode_velocity(velocity: Velocity, kind: VelocityType, stamp_ns: int = 0) -> bytes:
@@ -183,16 +156,12 @@ def encode_odometry(pose: Pose, velocity: Velocity, stamp_ns: int) -> bytes:
     return encode(new("Odometry", header(stamp_ns, "odom"), "base_link", *parts), "Odometry")
 
 
-def encode_image(
-    rgb: RgbImage, stamp_ns: int, *, encoding: str = "rgb8", padding: int = 0
-) -> bytes:
-    """An uncompressed picture; `padding` bytes follow every row."""
+def encode_image(rgb: RgbImage, stamp_ns: int) -> bytes:
+    """An uncompressed picture uint8 [h, w, 3], RGB."""
     height, width = rgb.shape[:2]
-    rows = _from_rgb(rgb, encoding).reshape(height, width * ENCODINGS[encoding][0])
-    rows = np.pad(rows, ((0, 0), (0, padding)))
-    size, data = (height, width), np.ascontiguousarray(rows).reshape(-1)
+    data = np.ascontiguousarray(rgb).reshape(-1)
     head = header(stamp_ns, "camera")
-    return encode(new("Image", head, *size, encoding, 0, rows.shape[1], data), "Image")
+    return encode(new("Image", head, height, width, "rgb8", 0, 3 * width, data), "Image")
 
 
 def encode_compressed_image(
@@ -233,7 +202,3 @@ def _twist(velocity: Velocity) -> Any:
     v3 = "geometry_msgs/msg/Vector3"
     linear = new(v3, float(velocity.forward_m_s), float(velocity.left_m_s), 0.0)
     return new("Twist", linear, new(v3, 0.0, 0.0, float(velocity.turn_rad_s)))
-
-
-def _xyz(vector: Any) -> tuple[float, float, float]:
-    return vector.x, vector.y, vector.z

@@ -29,8 +29,7 @@ long each time, so that a frozen camera moves no robot on and on."""
 class RobotClock:
     """The robot's clock against ours, from stamps and arrivals of all its messages.
 
-    The message that took the shortest way tells how far the clocks are apart. This may rise only
-    as slowly as clocks drift, so whatever takes longer is older.
+    The message of the shortest way tells; how far they are apart rises as slowly as clocks drift.
     """
 
     def __init__(self) -> None:
@@ -71,9 +70,7 @@ class RobotClock:
 class Stamps:
     """The stamps of one topic: what repeats or is older than the newest is not new.
 
-    Args:
-        clock: Of the computer that stamps this topic. Topics that share it learn of each other
-            when it was set.
+    clock: of the computer that stamps it. Topics that share it learn of each other when it was set.
     """
 
     def __init__(self, clock: RobotClock) -> None:
@@ -110,8 +107,7 @@ class Stamps:
     def _in_order(self, stamp_ns: int, arrived_s: float) -> bool:
         """Whether enough such messages ascend, and no faster than they arrive: no late burst.
 
-        Nor may another topic have gone on meanwhile: then the messages are old, and the clock was
-        not set.
+        Nor may another topic have gone on meanwhile: then the messages are old.
         """
         if self._row and stamp_ns <= self._row[-1][0]:
             self._row = []
@@ -142,8 +138,7 @@ class Sequences:
 class Pictures:
     """Tells a frozen camera that goes on sending: the robot moved, its picture did not change.
 
-    A robot that stands still may see the same for long, in a simulation to the last bit, and before
-    a plain wall also after it moved.
+    A robot that stands still may see the same for long, and after it moved before a plain wall.
     """
 
     def __init__(self) -> None:

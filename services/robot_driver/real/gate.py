@@ -1,7 +1,7 @@
 """What may be sent to a real robot now: below everything else (no clock, no thread).
 
-A velocity is a lease that the driver renews by its own calls. Contact, a lease that ran out and
-whatever else forbids motion turn it into standstill here, whoever asked for it.
+A velocity is a lease that the driver renews. Contact, a lease that ran out and whatever else
+forbids motion turn it into standstill here.
 """
 
 import math
@@ -120,10 +120,7 @@ class Gate:
         return along < 0.0 and self._zeros > 0
 
     def due(self, now_s: float) -> Velocity | None:
-        """What is to be sent now; None: nothing yet.
-
-        A change at once, motion every command period, a stop `ZEROS` times, then silence.
-        """
+        """What to send now, if anything: changes, motion every period, a stop `ZEROS` times."""
         self._count_way(now_s)
         velocity = self.in_force(now_s)
         if velocity != self._last:

@@ -1,7 +1,7 @@
 """A real robot behind any link: commands as leases, fresh sensors, stop on contact.
 
-Three threads touch it: the driver's, one that watches the bumper, and one that sends. The last one
-asks the `Gate` before every command, so a driver that hangs cannot keep a robot moving.
+Three threads touch it: the driver's, one that watches the bumper, and one that asks the `Gate`
+before every command, so a driver that hangs cannot keep a robot moving.
 """
 
 import logging
@@ -39,15 +39,10 @@ log = logging.getLogger(__name__)
 
 
 class HardwareRobot(Robot):
-    """A robot as `robot.Robot`, reached through a link.
+    """A robot as `robot.Robot`, reached through a link, which is opened here and closed by `close`.
 
-    Args:
-        config: Limits, periods, and how old readings may be.
-        link: How the robot is reached; opened here, closed by `close`.
-        clock: Monotonic seconds, as the link stamps its readings with.
-
-    Raises:
-        RobotFault: The robot did not answer in time. Sensors may answer later.
+    clock: monotonic seconds, as the link stamps its readings with. Raises RobotFault when the robot
+    did not answer in time. Sensors may answer later.
     """
 
     def __init__(
@@ -67,7 +62,11 @@ class HardwareRobot(Robot):
         self._closing = self._closed = False
         self._due_s = clock()
         try:
-            self._open()
+            link.open()
+            limit_s = clock() + READING_S
+            slots: tuple[Newest[Any], ...] = (link.odometry, link.bumper, link.camera)
+            for slot in slots:
+                slot.wait(0, max(limit_s - clock(), 0.0))
         except BaseException:
             link.close()
             raise
@@ -111,11 +110,9 @@ class HardwareRobot(Robot):
         return Felt(self._pose, contact)
 
     def drive(self, velocity: Velocity) -> None:
-        """Set the velocity, leased until `run` renews it.
+        """Set the velocity, leased until `run` renews it. Standstill is always taken.
 
-        Raises:
-            RobotFault: It is not finite or beyond the limits; the robot is told to stop then.
-            NotReady: The robot must not move now. Standstill is always taken.
+        Raises RobotFault, the robot told to stop, beyond the limits; NotReady if it must not move.
         """
         with self._changed:
             try:
@@ -126,10 +123,9 @@ class HardwareRobot(Robot):
             self._check()
 
     def run(self, duration_s: float, *, stop_on_contact: bool) -> bool:
-        """Let time pass while the bumper is watched.
+        """Let time pass while the bumper is watched. Raises NotReady, the robot told to stop.
 
-        Without `stop_on_contact` a slow robot may move with a pressed bumper, as far as a recovery
-        needs. Raises NotReady when the robot became unfit to drive; it is told to stop then.
+        Without `stop_on_contact` a slow robot may move with a pressed bumper, as a recovery needs.
         """
         now_s = self._clock()
         self._due_s = max(self._due_s, now_s - duration_s) + duration_s
@@ -177,16 +173,12 @@ class HardwareRobot(Robot):
         for thread in self._threads:
             thread.join(CLOSING_S)
         if not self._gate.silent:  # its own thread could not: try from here
-            self._send_zeros()
+            for _ in range(ZEROS):
+                self._hand_over(STANDSTILL)
         self._link.close()
 
-    # ------------------------------------------------------------ fit to drive
-
     def _check(self, *, contact: bool = False) -> None:
-        """Raise NotReady, the robot told to stop, when it must not move.
-
-        contact: What the exception tells of it.
-        """
+        """Raise NotReady, which tells of `contact`, when it must not move; it is told to stop."""
         with self._changed:
             self._gate.problem = problem = self._problem(self._clock())
             if self._gate.stuck:
@@ -233,15 +225,6 @@ class HardwareRobot(Robot):
         if self._motion.pushed and not pushed:
             self._gate.stop()  # who else drives it gets five stops against that
 
-    # ------------------------------------------------------------ threads
-
-    def _open(self) -> None:
-        self._link.open()
-        limit_s = self._clock() + READING_S
-        for name in ("odometry", "bumper", "camera"):
-            slot: Newest[Any] = getattr(self._link, name)
-            slot.wait(0, max(limit_s - self._clock(), 0.0))
-
     def _watch(self) -> None:
         """Let the gate know of every reading of the bumper as soon as it comes."""
         number = 0
@@ -270,7 +253,8 @@ class HardwareRobot(Robot):
                         return
                 velocity = self._due(now_s)
                 if velocity is None:
-                    self._changed.wait(TICK_S if self._busy else 0.1)
+                    busy = self._gate.wants_motion or not self._gate.silent
+                    self._changed.wait(TICK_S if busy else 0.1)
                     continue
             self._hand_over(velocity)
 
@@ -283,10 +267,6 @@ class HardwareRobot(Robot):
                 log.exception("looking at the robot failed")
                 self._gate.problem = f"link: {type(error).__name__}: {error}"
         return self._gate.due(now_s)
-
-    @property
-    def _busy(self) -> bool:
-        return self._gate.wants_motion or not self._gate.silent
 
     def _hand_over(self, velocity: Velocity) -> None:
         """Send one velocity without holding up the others meanwhile."""
@@ -304,10 +284,6 @@ class HardwareRobot(Robot):
             if not reason or not velocity.moving:
                 self._driven = velocity
             self._gate.sent(velocity, self._clock(), arrived=not reason)
-
-    def _send_zeros(self) -> None:
-        for _ in range(ZEROS):
-            self._hand_over(STANDSTILL)
 
 
 def _there(name: str, reading: Reading[T] | None) -> T:

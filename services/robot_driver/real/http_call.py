@@ -21,12 +21,7 @@ class _Socket(socket.socket):
 
 
 class Connection(http.client.HTTPConnection):
-    """A connection that is kept open between calls, and made anew when it was lost.
-
-    Args:
-        address: host or host:port.
-        limit_s: Longest time of a whole call: connecting, asking, head and body of the answer.
-    """
+    """A connection that is kept open, and made anew when lost. limit_s: of a whole call."""
 
     sock: Any
 
@@ -44,11 +39,8 @@ class Connection(http.client.HTTPConnection):
     ) -> tuple[int, bytes]:
         """Status and body of an answer; of a body longer than `limit`, one byte more than it.
 
-        Without `whole` the status is enough, and the body is read only as far as it comes.
-
-        Raises:
-            OSError: There is no connection, or (TimeoutError) no answer in time.
-            HTTPException: The answer is no HTTP, or breaks off.
+        Without `whole` the body is read only as far as it comes. Raises OSError (TimeoutError: no
+        answer in time), or HTTPException for an answer that is no HTTP or breaks off.
         """
         until_s = time.monotonic() + self._limit_s
         if self.sock is not None and select.select([self.sock], [], [], 0.0)[0]:

@@ -1,7 +1,6 @@
 """How a driver reaches a real robot: what its transport (HTTP, ROS 2) offers, and nothing more.
 
-A link has threads or callbacks of its own that put the newest readings into slots; `HardwareRobot`
-(`hardware.py`) takes them out, judges their age, and owns every decision about motion.
+A link puts the newest readings into slots; `HardwareRobot` judges them and decides on motion.
 """
 
 import logging
@@ -61,10 +60,9 @@ class Newest(Generic[T]):
     def wait(self, number: int, timeout_s: float) -> Reading[T] | None:
         """The newest reading once it is past `number`; None when none came in time."""
         with self._changed:
-            self._changed.wait_for(
+            newer = self._changed.wait_for(
                 lambda: self._reading is not None and self._reading.number > number, timeout_s
             )
-            newer = self._reading is not None and self._reading.number > number
             return self._reading if newer else None
 
 
@@ -92,10 +90,7 @@ class Slots:
         self._counting = threading.Lock()
 
     def refuse(self, name: str, why: str, *, heard: bool = True) -> None:
-        """Count what was no reading, and let its slot say why.
-
-        What was heard of bumper or battery and cannot be read ends what was read before.
-        """
+        """Count what was no reading; heard of bumper or battery, it ends what was read before."""
         slot: Newest[Any] = getattr(self, name)
         if heard and name in ("bumper", "battery"):
             slot.void(why)

@@ -69,11 +69,7 @@ def joined(start: Pose, step: Pose) -> Pose:
 
 
 class MotionWatch:
-    """Compares what a robot was told with the way that its odometry counts.
-
-    Args:
-        rest_s: Time that the robot needs to come to rest, or to move, its delay included.
-    """
+    """Compares what a robot was told with its odometry. rest_s: to come to rest or to move."""
 
     def __init__(self, rest_s: float) -> None:
         self._rest_s = rest_s

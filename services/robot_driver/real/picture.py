@@ -34,9 +34,8 @@ _ORIENTATION = 0x0112
 def decoded(data: bytes) -> RgbImage:
     """A whole JPEG or PNG as uint8 [h, w, 3], RGB, upright, maybe smaller than it was.
 
-    Raises:
-        BadMessage: It is neither, is larger than `MAX_SIDE_PX` either way, or is damaged, where
-            other decoders would fill in what is missing.
+    Raises BadMessage: it is neither, larger than `MAX_SIDE_PX` either way, or damaged, where other
+    decoders would fill in what is missing.
     """
     if not data.startswith((_JPEG, _PNG)):
         raise BadMessage("neither JPEG nor PNG")
@@ -55,17 +54,10 @@ def decoded(data: bytes) -> RgbImage:
 def raw(
     encoding: str, size_px: tuple[int, int], step: int, big_endian: bool, data: RgbImage
 ) -> RgbImage:
-    """The pixels of an uncompressed picture as uint8 [h, w, 3], RGB.
+    """The pixels of an uncompressed picture, flat uint8 data, as uint8 [h, w, 3], RGB.
 
-    Args:
-        encoding: One of `ENCODINGS`.
-        size_px: Width and height.
-        step: Bytes of a row, padding included.
-        big_endian: Order of the bytes of mono16.
-        data: uint8, flat.
-
-    Raises:
-        BadMessage: The encoding is another one, or the sizes do not fit.
+    step: bytes of a row, padding included. big_endian: order of the bytes of mono16. Raises
+    BadMessage for an encoding that is none of `ENCODINGS`, or sizes that do not fit.
     """
     if encoding not in ENCODINGS:
         raise BadMessage(f"unknown encoding: {encoding!r:.24}, accepted: {', '.join(ENCODINGS)}")

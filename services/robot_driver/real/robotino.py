@@ -19,21 +19,14 @@ from shared.rl.preprocess import preprocess
 
 log = logging.getLogger(__name__)
 
-SERVER_SPEED_M_S, SERVER_TURN_RAD_S = 2.0, 3.0
-"""The robot's server refuses faster commands instead of cutting them."""
+MOST = (2.0, 2.0, 3.0)
+"""m/s ahead and aside, rad/s. The robot's server refuses faster commands."""
 LABEL = "?sid=corridor"
 """Names this client to the robot; it needs no login."""
 
 
 class RobotinoLink(Slots):
-    """A Robotino as `link.Link`.
-
-    Args:
-        config: `robot.robotino` says where it is and how often its sensors are read.
-
-    Raises:
-        ConfigError: The address cannot be one.
-    """
+    """A Robotino as `link.Link`. Raises ConfigError for an address that cannot be one."""
 
     def __init__(self, config: Config) -> None:
         super().__init__()
@@ -78,11 +71,8 @@ class RobotinoLink(Slots):
 
     def send(self, velocity: Velocity) -> None:
         """Put one velocity, cut to what the robot's server accepts. Raises RobotFault."""
-        wanted = (
-            _cut(velocity.forward_m_s, SERVER_SPEED_M_S),
-            _cut(velocity.left_m_s, SERVER_SPEED_M_S),
-            _cut(velocity.turn_rad_s, SERVER_TURN_RAD_S),
-        )
+        parts = (velocity.forward_m_s, velocity.left_m_s, velocity.turn_rad_s)
+        wanted = [max(-most, min(most, part)) for part, most in zip(parts, MOST, strict=True)]
         try:
             content = json.dumps(wanted, allow_nan=False).encode()
             path, limit = "/data/omnidrive" + LABEL, replies.MAX_JSON_BYTES
@@ -98,8 +88,6 @@ class RobotinoLink(Slots):
         for thread in self._threads:
             thread.join(self._config.timeout_s + 1.0)
         self._commands.close()
-
-    # ------------------------------------------------------------ reading
 
     def _poll(self, name: str, path: str, period_s: float, limit: int) -> None:
         """Read one sensor for ever, each time a period after the last began."""
@@ -118,10 +106,7 @@ class RobotinoLink(Slots):
         connection.close()
 
     def take(self, name: str, status: int, body: bytes | None, began_s: float) -> None:
-        """Take one answer (None: it was too large) to a request that began at `began_s`.
-
-        An answer that cannot be read ends what was read before of bumper and battery.
-        """
+        """Take one answer (None: it was too large) to a request that began at `began_s`."""
         try:
             if status != HTTPStatus.OK:
                 raise BadMessage(f"status {status}")
@@ -163,7 +148,3 @@ def _reason(error: Exception) -> str:
     if isinstance(error, TimeoutError):
         return "timeout"
     return "no connection" if isinstance(error, OSError) else "broken answer"
-
-
-def _cut(value: float, most: float) -> float:
-    return max(-most, min(most, value))

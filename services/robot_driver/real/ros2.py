@@ -1,8 +1,7 @@
 """A ROS 2 robot over Zenoh as `link.Link`: through zenoh-bridge-ros2dds or through rmw_zenoh.
 
-Zenoh's threads put bytes into an inbox; one thread of the link decodes and judges them. What the
-robot says counts only while it is fresh: liveliness tokens tell types, never that a robot lives
-(a cut-off robot's tokens stay for ten seconds).
+One thread of the link decodes. Liveliness tokens tell types, never that a robot lives: those of a
+cut-off robot stay for ten seconds.
 """
 
 import logging
@@ -46,8 +45,6 @@ class Ros2Link(Ros2Sensors):
         self._last_stamp_ns = 0
         self._done = threading.Event()
         self._thread = threading.Thread(target=self._run, name="ros2-link", daemon=True)
-
-    # ------------------------------------------------------------ link.Link
 
     def open(self) -> None:
         """Connect and begin to read. Raises RobotFault when no router of the robot answers."""
@@ -111,8 +108,6 @@ class Ros2Link(Ros2Sensors):
         if self._bus is not None:
             self._bus.close()
 
-    # ------------------------------------------------------------ names and types
-
     def _velocity_type(self) -> tuple[VelocityType, str]:
         """Which type to send (empty: unknown), and what speaks against sending."""
         if not self._publishers or self._done.is_set():
@@ -126,8 +121,6 @@ class Ros2Link(Ros2Sensors):
             self._ros.transport,
         )
         return cast(VelocityType, chosen), obstacle
-
-    # ------------------------------------------------------------ the link's thread
 
     def _connect(self) -> ForeignBus:
         limit_s = time.monotonic() + self._hardware.open_timeout_s
@@ -175,13 +168,8 @@ class Ros2Link(Ros2Sensors):
                 self.refuse(name, "too long or too many")
                 self.faults[fault] = count
 
-    # ------------------------------------------------------------ the robot's clock
-
     def _stamp_ns(self, now_s: float) -> int:
-        """Now, on the robot's clock; 0 (which means now) without.
-
-        Bases refuse stamps that are old or go back, and nobody sets our clock by theirs.
-        """
+        """Now, on the robot's clock, never going back, which bases refuse; 0 (now) without."""
         stamp_ns = self._robot_clock.stamp_ns(now_s)
         if stamp_ns <= 0:
             return 0

@@ -1,8 +1,8 @@
 """How topics of a ROS 2 robot are called on Zenoh, and what the network says of them (pure).
 
-Two ways lead there: zenoh-bridge-ros2dds names topics alone, and tells types by liveliness tokens
-(its README and `liveliness_mgt.rs`); rmw_zenoh names topic, type and hash of the type, and adds an
-attachment to every sample (its `docs/design.md` and `attachment_helpers.cpp`).
+zenoh-bridge-ros2dds names topics alone, and tells types by liveliness tokens (`liveliness_mgt.rs`);
+rmw_zenoh names topic, type and its hash, and adds an attachment to every sample (its
+`docs/design.md` and `attachment_helpers.cpp`).
 """
 
 import struct
@@ -131,60 +131,39 @@ def velocity_type(
     matching: Mapping[str, bool],
     transport: Literal["bridge", "rmw-zenoh"],
 ) -> tuple[str, str]:
-    """Which type of velocity to send, and why none may be sent now.
+    """Which type of velocity to send, and why none may be sent now; each empty if there is none.
 
-    Args:
-        configured: `Twist`, `TwistStamped` or `auto`.
-        topic: Where it is sent.
-        listening: Full names of the types that tokens tell of.
-        matching: By short type, whether Zenoh knows a subscriber of our key.
-        transport: The bridge has one key whatever the type.
-
-    Returns:
-        Short type (empty when unknown), and an obstacle in one line (empty when there is none).
+    configured: `Twist`, `TwistStamped` or `auto`. listening: full names of the types that tokens
+    tell of. matching: by short type, whether Zenoh knows a subscriber of our key.
     """
-    chosen, obstacle = _chosen_type(configured, topic, listening, matching, transport)
-    if obstacle or matching[chosen]:
-        return chosen, obstacle
-    if listening and transport == "rmw-zenoh":
+    bridge = transport == "bridge"
+    known = [name for name, full in VELOCITY_TYPES.items() if full in listening]
+    told = " and ".join(sorted(short(name) for name in listening))
+    if configured != "auto":
+        # On the bridge's one key everybody gets what is sent: one of another type is too many.
+        alone = listening <= {VELOCITY_TYPES[configured]} or not bridge
+        if listening and (configured not in known or not alone):
+            return "", f"robot listens for {told} on {topic}, configured {configured}"
+        known = [configured]
+    elif listening:
+        if len(known) != 1 or (transport == "bridge" and len(listening) > 1):
+            return "", f"robot listens for {told} on {topic}, expected either Twist or TwistStamped"
+    else:
+        known = [name for name, matches in matching.items() if matches]
+        if len(known) > 1 or (known and bridge):
+            return "", (
+                f"the network does not tell what the robot listens for on {topic}: "
+                f"set robot.ros2.velocity_type"
+            )
+    chosen = known[0] if known else ""
+    if matching.get(chosen):
+        return chosen, ""
+    if listening and not bridge:
         return chosen, (
             f"robot listens for {chosen} on {topic} with another hash of the type: "
             f"check robot.ros2.distribution"
         )
     return chosen, f"nothing on the robot listens on {topic}"
-
-
-def _chosen_type(
-    configured: str,
-    topic: str,
-    listening: frozenset[str],
-    matching: Mapping[str, bool],
-    transport: Literal["bridge", "rmw-zenoh"],
-) -> tuple[str, str]:
-    """Which type fits the configuration and those who listen, and why none does."""
-    known = {name for name, full in VELOCITY_TYPES.items() if full in listening}
-    told = " and ".join(sorted(short(name) for name in listening))
-    # On the bridge's one key everybody gets what is sent: one listener of another type is too many.
-    alone = listening <= {VELOCITY_TYPES.get(configured, "")} or transport == "rmw-zenoh"
-    if configured != "auto":
-        if listening and (configured not in known or not alone):
-            return "", f"robot listens for {told} on {topic}, configured {configured}"
-        return configured, ""
-    if listening:
-        if len(known) != 1 or (transport == "bridge" and len(listening) > 1):
-            return "", f"robot listens for {told} on {topic}, expected either Twist or TwistStamped"
-        (chosen,) = known
-        return chosen, ""
-    candidates = [name for name, matches in matching.items() if matches]
-    if not candidates:
-        return "", f"nothing on the robot listens on {topic}"
-    if transport == "bridge" or len(candidates) > 1:
-        return "", (
-            f"the network does not tell what the robot listens for on {topic}: "
-            f"set robot.ros2.velocity_type"
-        )
-    (chosen,) = candidates
-    return chosen, ""
 
 
 def _bridged(letters: str, topic: str, type_name: str) -> Endpoint | None:

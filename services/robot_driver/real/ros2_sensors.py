@@ -31,8 +31,7 @@ class Ros2Sensors(Slots):
     """The sensors of a ROS 2 robot: slots of `link.Link`, and what is known of their messages.
 
     A bumper that is published on change alone is silent for hours. Once it was heard, every new
-    odometry shows that the robot still talks and had nothing new to tell, while the network tells
-    that somebody publishes it. Before that it is unknown, and the robot does not drive.
+    odometry shows that the robot still talks, while the network tells that somebody publishes it.
     """
 
     def __init__(self, ros: Ros2Config) -> None:
@@ -126,10 +125,7 @@ class Ros2Sensors(Slots):
             self.bumper.put(last.value, made_s)
 
     def _made_s(self, name: str, sample: RawSample, stamp_ns: int) -> float | None:
-        """When a sample was made, on our clock; None for one that repeats or comes late.
-
-        Whether a bumper was touched since is unknown when its messages come late.
-        """
+        """When a sample was made, on our clock; None for one that repeats or comes late."""
         stamps = self._stamps[name]
         if self._ros.transport == "rmw-zenoh":
             attachment = ros2_names.unpacked(sample.attachment)

@@ -1,8 +1,4 @@
-"""The ROS 2 message types that a robot is driven with, and their CDR, without a ROS installation.
-
-The only file that imports rosbags. Before bytes are decoded their size and encapsulation are
-checked. Stamps are nanoseconds of the robot's clock; 0: none told.
-"""
+"""The ROS 2 types that a robot is driven with, and their CDR. Only this imports rosbags."""
 
 from __future__ import annotations
 
@@ -23,31 +19,21 @@ CameraType = Literal["Image", "CompressedImage"]
 BumperType = Literal["Bool", "HazardDetectionVector"]
 BatteryType = Literal["BatteryState", "PowerReadings"]
 
-FULL_NAMES = {
-    "Twist": "geometry_msgs/msg/Twist",
-    "TwistStamped": "geometry_msgs/msg/TwistStamped",
-    "Odometry": "nav_msgs/msg/Odometry",
-    "Image": "sensor_msgs/msg/Image",
-    "CompressedImage": "sensor_msgs/msg/CompressedImage",
-    "Bool": "std_msgs/msg/Bool",
-    "HazardDetectionVector": "irobot_create_msgs/msg/HazardDetectionVector",
-    "BatteryState": "sensor_msgs/msg/BatteryState",
-    "PowerReadings": "rto_msgs/msg/PowerReadings",
-}
-"""Full names of the types that a robot is driven with, by short name."""
-
 KIB = 1024
-MAX_BYTES = {
-    "Twist": 4 * KIB,
-    "TwistStamped": 4 * KIB,
-    "Odometry": 16 * KIB,
-    "Image": 3 * 2048 * 2048 + 4 * KIB,
-    "CompressedImage": 4 * KIB * KIB,
-    "Bool": 64,
-    "HazardDetectionVector": 64 * KIB,
-    "BatteryState": 16 * KIB,
-    "PowerReadings": 4 * KIB,
+_TYPES = {
+    "Twist": ("geometry_msgs/msg/Twist", 4 * KIB),
+    "TwistStamped": ("geometry_msgs/msg/TwistStamped", 4 * KIB),
+    "Odometry": ("nav_msgs/msg/Odometry", 16 * KIB),
+    "Image": ("sensor_msgs/msg/Image", 3 * 2048 * 2048 + 4 * KIB),
+    "CompressedImage": ("sensor_msgs/msg/CompressedImage", 4 * KIB * KIB),
+    "Bool": ("std_msgs/msg/Bool", 64),
+    "HazardDetectionVector": ("irobot_create_msgs/msg/HazardDetectionVector", 64 * KIB),
+    "BatteryState": ("sensor_msgs/msg/BatteryState", 16 * KIB),
+    "PowerReadings": ("rto_msgs/msg/PowerReadings", 4 * KIB),
 }
+FULL_NAMES = {short: name for short, (name, _) in _TYPES.items()}
+"""Full names of the types that a robot is driven with, by short name."""
+MAX_BYTES = {short: most for short, (_, most) in _TYPES.items()}
 """Longest payload of each type; longer ones are refused unread."""
 
 # Fields of the types that do not come with ROS itself.
@@ -101,10 +87,7 @@ def encode(message: Any, kind: str, *, little_endian: bool = True) -> bytes:
 
 
 def decode(raw: bytes, kind: str) -> Any:
-    """The message in CDR bytes; kind: short name of its type.
-
-    Raises BadMessage unless they are the bytes of that type, no more and no fewer but padding.
-    """
+    """The message in CDR bytes; kind: short name of its type. Raises BadMessage unless all fits."""
     if not raw:
         raise BadMessage("empty")
     if len(raw) > MAX_BYTES[kind]:

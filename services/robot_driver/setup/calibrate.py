@@ -57,17 +57,9 @@ def calibrate(
 ) -> CalibrationConfig:
     """Drive ahead and back, turn both ways, and compare with the actions that turn.
 
-    Args:
-        config: Of the robot.
-        robot: Ready to drive, with `space_m` free ahead of it and room to turn.
-        link: Its odometry.
-        space_m: Longest way ahead.
-        made: Provenance.
-        echo: Shows a line.
-
-    Raises:
-        RobotMissing: The robot cannot drive.
-        ConfigError: It touched something, did not follow, or two measurements disagree.
+    robot: ready to drive, with `space_m` free ahead of it and room to turn. made: provenance.
+    Raises RobotMissing if it cannot drive, ConfigError if it touched something, did not follow, or
+    two measurements disagree.
     """
     driver = _Drives(config, robot, link, echo)
     speed, turn = config.robot.speed_m_s, config.robot.turn_rad_s
@@ -115,11 +107,8 @@ class _Drives:
             found = response(np.array(tape.times_s), tape.way(velocity), driven_s)
         except ValueError as error:
             raise ConfigError(f"robot calibrate: {name}: {error}") from error
-        told, unit = (
-            (abs(velocity.forward_m_s), "m/s")
-            if velocity.forward_m_s
-            else (abs(velocity.turn_rad_s), "rad/s")
-        )
+        told = abs(velocity.forward_m_s or velocity.turn_rad_s)
+        unit = "m/s" if velocity.forward_m_s else "rad/s"
         self._echo(
             f"{name:12} told {told:.3f} {unit}, does {found.speed:.3f} {unit} "
             f"after {found.delay_s:.2f} s"
@@ -127,10 +116,7 @@ class _Drives:
         return found
 
     def compare(self, action: int, found: CalibrationConfig) -> None:
-        """Drive an action that turns. Raises ConfigError where it turns otherwise than on the spot.
-
-        A bend is short, because it needs room to the side.
-        """
+        """Drive an action that turns. Raises ConfigError where it turns unlike on the spot."""
         velocity = action_velocity(self._config, action)
         tape = self.tape(velocity, TURN_S)
         turned = response(

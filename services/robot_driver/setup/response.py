@@ -1,7 +1,7 @@
 """How a robot follows one command, read off its odometry (no clock, no robot).
 
-A base waits for its delay, speeds up evenly, then goes on at a steady speed. The speed is the slope
-of the last part of the way. The delay is the one with which such a base comes closest to the rest.
+A base waits for its delay, speeds up evenly, then goes on at a steady speed, the slope of the last
+part of the way. The delay is the one with which such a base comes closest to the rest.
 """
 
 from typing import NamedTuple
@@ -29,11 +29,9 @@ class Response(NamedTuple):
 
 
 def response(times_s: Floats, way: Floats, driven_s: float) -> Response:
-    """What a robot made of a command that was in force for `driven_s`.
+    """What a robot made of a command that was in force for `driven_s`. Raises ValueError.
 
-    times_s: Of the readings since the command, ascending. way: Metres or radians in its direction.
-
-    Raises ValueError: too few readings, no way, or no steady speed.
+    times_s: of the readings since the command, ascending. way: metres or radians in its direction.
     """
     driven = times_s <= driven_s
     times_s, way = times_s[driven], way[driven] - way[0]

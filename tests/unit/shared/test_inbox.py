@@ -81,7 +81,7 @@ def test_senders_are_bounded_and_a_newer_message_takes_the_place_of_an_older() -
         for number in range(MAX_SENDERS + 1):
             wire.receive(f"robot{number}", b"")
     wire.receive(None, b"")
-    assert inbox.refused_total + inbox.busy_total == 3
+    assert inbox.refused.total() + inbox.busy.total() == 3
     assert len(inbox._latest) == MAX_SENDERS
 
 

@@ -20,7 +20,7 @@ def test_every_stream_is_typed_and_bounded(stream: Stream) -> None:
     assert bool(stream.reply) == (stream.delivery == "request")
     assert 0 < stream.max_bytes <= 32 * 1024 * 1024
     assert (stream.queue == 1) if stream.delivery == "latest" else (stream.queue > 1)
-    assert all((stream.senders, stream.receivers, stream.rate, stream.overflow))
+    assert all((stream.senders, stream.receivers, stream.rate))
     assert stream.pattern.startswith("{run}/")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -121,7 +122,7 @@ class Replay:
             wake=lambda: None,
             wait=lambda _: None,
             take=lambda *_: [("main", self._lie(ReplayState) or self.state())],
-            refused_total=0,
+            refused=Counter(),
         )
 
     def state(self, **given: Any) -> ReplayState:

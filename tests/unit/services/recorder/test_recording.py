@@ -34,8 +34,8 @@ from shared.config import ActorNumerics, Config
 from shared.errors import ConfigError, StateError
 from shared.keys import ACTION, OBSERVATION
 from shared.messages import Action, Observation, image_array
-from shared.rl.decision import decide
 from shared.rl.network import initialised, to_bytes
+from shared.rl.policy import decide
 from shared.rl.predictor import Predictor
 from shared.settings import to_toml
 

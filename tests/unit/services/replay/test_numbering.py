@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import msgpack
@@ -195,7 +196,7 @@ def test_counters_survive_the_way_to_disk(
         make_episode(n, ended=ended, robot=f"robot{odd}") for n, ended, _, odd, _ in given_episodes
     ]
     _, counters = after(NO_FILL, *made)
-    stored = msgpack.unpackb(msgpack.packb(counters.to_dict()))
+    stored = msgpack.unpackb(msgpack.packb(asdict(counters)))
     assert Counters.from_dict(stored) == counters
 
 

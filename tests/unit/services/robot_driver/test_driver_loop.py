@@ -6,6 +6,7 @@ import logging
 import subprocess
 import sys
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,7 +24,7 @@ from services.robot_driver.real.hardware import HardwareRobot
 from services.robot_driver.recovery import WatchedRobot, back_off
 from services.robot_driver.robot import STANDSTILL, Felt, Pose, Velocity
 from services.robot_driver.safety import Safety
-from services.robot_driver.service import DriverLoop, ServiceHost
+from services.robot_driver.service import DriverLoop
 from shared import statefile
 from shared.config import Config
 from shared.halts.book import new_halt
@@ -67,7 +68,7 @@ class FakeBus:
         self.observations: list[Observation] = []
         self.actions: list[Action] = []
         self.commands: list[Request] = []
-        self.refused_total = self.busy_total = 0
+        self.refused = self.busy = Counter[str]()
         self.router = "1"
         self.asked = 0
         """How often halts in force were asked for."""
@@ -113,9 +114,8 @@ class Stand:
 
     def __init__(self, folder: Path, config: Config) -> None:
         self.link, self.bus, self.folder = FakeLink(), FakeBus(), folder
-        host = ServiceHost(folder / "world")
         self.robot = HardwareRobot(config.robot, self.link)
-        self.driver = Driver(config, self.robot, LIFE, host)
+        self.driver = Driver(config, self.robot, LIFE)
         self.stop = StopFlag()
         self.numbers: list[int] = []
         self.kinds: list[HaltKind] = []
@@ -128,7 +128,7 @@ class Stand:
             ident=config.robot.id,
             life=LIFE,
         )
-        self.loop = DriverLoop(me, self.driver, host, folder)
+        self.loop = DriverLoop(me, self.driver, folder)
         self.thread = threading.Thread(target=self.loop.run)
         self.thread.start()
 

@@ -676,5 +676,5 @@ def test_lost_actions_are_counted_once_whoever_is_killed_and_interrupted(events:
         drive(actor, replay, observation)
         stored = sum(e.count for e in replay.episodes)
         executed_open = len(actor.open) - 1
-        waiting = actor.state()["unreported"][0]
+        waiting = actor.state()["_unreported_samples"]
         assert stored + replay.dropped + waiting + executed_open == sequence

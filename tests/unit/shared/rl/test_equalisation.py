@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from shared.config import MemoryConfig
 from shared.rl import memory as memory_module
-from shared.rl.equalisation import equalised
 from shared.rl.memory import ReplayMemory
+from shared.rl.reward import equalised
 from shared.rl.schedule import Moment
 from shared.rl.turn import maintain
 

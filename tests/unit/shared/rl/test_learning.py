@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -52,11 +53,15 @@ class Recorder(Trainer):
         super().__init__(SMALL, LearningConfig(**learning), Numerics(batch=16), 1)
         self.ranks: list[list[int]] = []
         self.mirrored: list[Any] = []
+        self.gradients: Any = SimpleNamespace(compute=self._note, deferred=False)
 
-    def _step(self, batches: Any, ranks: Any, mirrored: Any, losses: Any, **_: Any) -> float:
+    def _note(self, batches: Any, ranks: Any, mirrored: Any) -> torch.Tensor:
         self.ranks.append([int(r) for r in ranks])
         self.mirrored.append(mirrored)
-        return 0.0
+        return torch.zeros(())
+
+    def _descend(self) -> None:
+        pass
 
 
 # ------------------------------------------------------------------------- one step

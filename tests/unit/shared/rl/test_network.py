@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from typing import Literal
@@ -17,7 +16,6 @@ from shared.config import NetworkConfig, Numerics
 from shared.rl.engine import network_input
 from shared.rl.network import (
     QNetwork,
-    WeightsHash,
     checked,
     initialised,
     load_bytes,
@@ -398,13 +396,6 @@ def test_a_successor_predicts_with_other_weights_and_leaves_the_first_alone() ->
     assert (first.version, second.version) == (7, 9)
     assert np.array_equal(first.all_values(images), before)
     assert not np.array_equal(second.all_values(images), before)
-
-
-def test_the_hash_of_weights_does_not_depend_on_how_they_are_cut() -> None:
-    data, digest = save(tensors(6)), WeightsHash()
-    for start in range(0, len(data), 1000):
-        digest.add(data[start : start + 1000])
-    assert digest.text == weights_hash(data) == hashlib.sha256(data).hexdigest()[:16]
 
 
 def test_read_only_images_as_received_from_the_bus_are_fine() -> None:

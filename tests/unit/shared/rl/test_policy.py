@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shared.config import Config, PolicyConfig
-from shared.rl.decision import decide
 from shared.rl.draws import generator
-from shared.rl.policy import choose, choose_uniformly, distribution
+from shared.rl.policy import choose, choose_uniformly, decide, distribution
 
 Kind = Literal["eps-greedy", "roulette", "eps-greedy-roulette"]
 KINDS: tuple[Kind, ...] = ("eps-greedy", "roulette", "eps-greedy-roulette")
@@ -155,4 +154,4 @@ def test_filling_draws_apart_from_driving() -> None:
     config, values = Config(), np.zeros(3, np.float32)
     draws = [generator(config.run.seed, "fill", "robot", 2, step) for step in range(50)]
     filled = [decide(config, "robot", values, filling=True, episode=2, step=s) for s in range(50)]
-    assert filled == [(choose_uniformly(draw), False) for draw in draws]
+    assert filled == [(choose_uniformly(draw), "chance") for draw in draws]
