@@ -16,7 +16,7 @@ def gather_heap() -> None:
     """Let all threads allocate from one heap, large arrays too, and keep what they free.
 
     Otherwise passes over the memory leave up to a gigabyte of holes, or get every intermediate
-    array as new, zeroed pages, for half of their time. Call it before there are other threads.
+    array as new, zeroed pages, in up to half of their time. Call it before other threads begin.
     """
     library = ctypes.CDLL(None)
     if hasattr(library, "mallopt"):
