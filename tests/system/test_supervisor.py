@@ -187,7 +187,7 @@ def test_a_signal_stops_everything_within_five_seconds(
     with up(tmp_path, SLEEP, SLEEP, STUBBORN) as process:
         fake_pids(tmp_path, 3)
         children = family(process)
-        assert len(children) == 4  # with the router
+        assert len(children) == 5  # with router and page
         endpoint = (tmp_path / "endpoint").read_text()
         assert endpoint.startswith("tcp/127.0.0.1:")
         process.send_signal(number)
@@ -217,7 +217,7 @@ def test_nothing_is_left_after_kill_9(tmp_path: Path) -> None:
     with up(tmp_path, SLEEP, STUBBORN) as process:
         fake_pids(tmp_path, 2)
         children = family(process)
-        assert len(children) == 3
+        assert len(children) == 4  # with the page
         process.kill()
         wait_until(lambda: not any(exists(pid) for pid in children), 20, "the end of all children")
     assert not is_up(tmp_path)
