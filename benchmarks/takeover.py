@@ -25,8 +25,8 @@ from services.commander.keyboard import DEADMAN_S
 from services.launcher.up import free_endpoint
 from shared import settings
 from shared.config import Config
-from shared.keys import ACTION
-from shared.messages import Action, RobotState
+from shared.keys import ACTION, ACTOR_STATE
+from shared.messages import Action, ActorState, RobotState
 
 COMMAND = Path(sys.executable).with_name("corridor")
 KEY, REPEAT_S = b"a", 0.03
@@ -68,6 +68,8 @@ def reactions(config: Config, rounds: int) -> list[float]:
         rig.start_all()
         actions = rig.bus.inbox()
         actions.subscribe(ACTION)
+        actions.subscribe(ACTOR_STATE)
+        rig.wait(lambda: actions.take(ACTOR_STATE, ActorState), "an actor serves the robot")
 
         def answered(_at_s: float) -> float | None:
             actions.wait(0.005)
