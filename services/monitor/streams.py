@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from shared.bus import Bus
 from shared.codec import decode
@@ -105,12 +105,9 @@ def watch(config: Config, action: str, name: str, seconds: float) -> None:
                 for line in gauge.news():
                     console.print(line, soft_wrap=True)
             else:
-                table = Table(
-                    *COLUMNS,
-                    box=None,
-                    pad_edge=False,
-                    caption=f"not to be watched: {' '.join(HIDDEN)}",
-                )
+                columns = (Column(title, no_wrap=True) for title in COLUMNS)
+                hidden = f"not to be watched: {' '.join(HIDDEN)}"
+                table = Table(*columns, box=None, pad_edge=False, caption=hidden)
                 for row in gauge.rows():
                     table.add_row(*row)
                 console.clear()  # of a terminal only
