@@ -24,7 +24,7 @@ from shared.threads import stop_on_signals
 
 PUBLISHED = {s.name: s for s in STREAMS if s.delivery == "latest" and "watcher" in s.receivers}
 HIDDEN = [stream.name for stream in STREAMS if stream.name not in PUBLISHED]
-COLUMNS = ("stream", "sender", "rate", "size", "age", "newest")
+COLUMNS = ("stream", "sender", "rate", "size", "age")
 PERIOD_S, KEPT = 1.0, 256
 """Of each sender so many newest messages are kept: rates are of these, `echo` prints them."""
 
@@ -105,9 +105,9 @@ def watch(config: Config, action: str, name: str, seconds: float) -> None:
                 for line in gauge.news():
                     console.print(line, soft_wrap=True)
             else:
-                columns = (Column(title, no_wrap=True) for title in COLUMNS)
+                columns = (*COLUMNS, Column("newest", no_wrap=True, ratio=1))
                 hidden = f"not to be watched: {' '.join(HIDDEN)}"
-                table = Table(*columns, box=None, pad_edge=False, caption=hidden)
+                table = Table(*columns, box=None, pad_edge=False, caption=hidden, expand=True)
                 for row in gauge.rows():
                     table.add_row(*row)
                 console.clear()  # of a terminal only
