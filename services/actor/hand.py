@@ -23,7 +23,7 @@ class Hand:
         self._path = path
         self.taken = path.exists()
         self.life = ""
-        """Of the commander that was heard last."""
+        """Which commander was heard last."""
         self.refused = 0
         """Messages of another person than the one who drives, or out of order."""
         self._number = -1
@@ -36,7 +36,10 @@ class Hand:
         self._look_s = self._act_s = 0.0
 
     def note(self, wish: Takeover, now_s: float) -> None:
-        """Take a message, which counts as made now."""
+        """Take a message, which counts as made now.
+
+        Raises OSError when a restart could not know of it; it holds all the same.
+        """
         if wish.life != self.life:
             if self.taken and self.silent_s(now_s) < HOLDER_SILENT_S:
                 self.refused += 1
@@ -46,12 +49,12 @@ class Hand:
             self.refused += 1
             return
         self._number, self._heard_s, self._action = wish.number, now_s, wish.action
+        before, self.taken = self.taken, not wish.give_back
         if wish.give_back:
             self._path.unlink(missing_ok=True)
-        elif not self.taken:
+        elif not before:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._path.touch()
-        self.taken = not wish.give_back
 
     def looked(self, now_s: float) -> None:
         """The robot sent an observation that it was not asked about before."""

@@ -88,9 +88,15 @@ class ActorLoop:
                     )
             for robot, wish in self._inbox.take(TAKEOVER, Takeover):
                 if robot in self._sessions:
-                    self._sessions[robot].hand.note(wish, time.monotonic())
+                    self._note(robot, wish)
             self._answer()
             self._beat()
+
+    def _note(self, robot: str, wish: Takeover) -> None:
+        try:
+            self._sessions[robot].hand.note(wish, time.monotonic())
+        except OSError as error:
+            self._me.log.error("%s: a restart would not know who drives: %s", robot, error)
 
     def _has_room(self, robot: str) -> bool:
         """Whether the robot is served, or can be now. One with an actor of its own is not."""

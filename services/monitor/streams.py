@@ -26,7 +26,7 @@ PUBLISHED = {s.name: s for s in STREAMS if s.delivery == "latest" and "watcher" 
 HIDDEN = [stream.name for stream in STREAMS if stream.name not in PUBLISHED]
 COLUMNS = ("stream", "sender", "rate", "size", "age")
 PERIOD_S, KEPT = 1.0, 256
-"""Of each sender so many newest messages are kept: rates are of these, `echo` prints them."""
+"""How often rates are shown, and how many messages of each sender they are taken from."""
 
 
 class Gauge:

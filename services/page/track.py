@@ -27,7 +27,7 @@ class Track:
         self.trail: deque[tuple[float, float] | None] = deque(maxlen=TRAIL)
         self.bumps: deque[tuple[float, float]] = deque(maxlen=BUMPS)
         self.delays_ms: deque[float] = deque(maxlen=DELAYS)
-        """From an observation to its answer, as both arrived here."""
+        """How long observations waited for their answers, as both arrived here."""
         self._waiting: dict[tuple[str, int, int], float] = {}
 
     def take(self, message: Message, at_s: float) -> None:

@@ -95,7 +95,7 @@ class Position:
     lineage: str = NO_LINEAGE
     """The lineage that the memory had at `change`."""
     turn_lineage: str = NO_LINEAGE
-    """Of the memory as of `turn_change`."""
+    """The lineage that it had at `turn_change`."""
 
 
 class Tables:

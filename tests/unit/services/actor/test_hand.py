@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -54,6 +55,16 @@ def test_a_restarted_actor_lets_no_network_drive_a_robot_that_was_taken_over(
     after.note(said(1, None, OTHER, give_back=True), 0.0)
     assert not after.taken
     assert not Hand(path).taken
+
+
+def test_a_full_disk_keeps_nobody_from_taking_over(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    hand = Hand(tmp_path / "file" / "robot1.taken")  # there can be no such file
+    with pytest.raises(OSError, match="file"):
+        hand.note(said(1, 2), 0.0)
+    assert (hand.taken, hand.wish(0.1)) == (True, 2)
+    hand.note(said(2, None), 0.2)  # it is told of once
+    assert hand.taken
 
 
 MESSAGES = st.lists(
